@@ -6,9 +6,12 @@ from __future__ import annotations
 import pytest
 import torch
 from recorded import assert_same_state
+from torch.autograd import forward_ad
 
 import torchfilm as tf
+from torchfilm.effects.bound_mechanics import BoundMechanics
 from torchfilm.joined_step import JoinedStep
+from torchfilm.tools.tangents import forward_mode
 
 pytest.importorskip("numba")
 
@@ -106,3 +109,41 @@ def test_time_is_told_of_each_effect():
     timings, model = tf.Timings(), scene_of(2, "length", {}).bind()
     model.step(model.start(), timings=timings)
     assert set(timings.seconds) == {"growth", "mechanics", "division"}
+
+
+def test_a_tangent_of_a_rate_is_refused_and_not_lost():
+    model = scene_of(2, "length", {}).bind(dtype=torch.float64)
+    state = model.start()
+    with forward_mode():
+        rate = forward_ad.make_dual(state.growth_rate, torch.ones_like(state.growth_rate))
+        with pytest.raises(tf.InputError, match="no forward mode"):
+            model.step(state.with_fields(growth_rate=rate))
+
+
+def test_a_gradient_by_a_drag_that_was_drawn_is_not_lost():
+    scene = tf.Scene(
+        tf.Growth(rate=1.0),
+        tf.Mechanics(dim=2, viscosity=tf.LogNormal(1.0, 0.2), tolerance=1e-6),
+        founders=tf.Cells([[0.0, 0.0], [2.5, 0.1]], [[1.0, 0.0]] * 2, length=2.0),
+    )
+    model = scene.bind(dtype=torch.float64)
+    state = model.start()
+    drag = state.mechanics_viscosity.clone().requires_grad_()
+    after = model.step(state.with_fields(mechanics_viscosity=drag), 0.05)
+    (slope,) = torch.autograd.grad(after.position[0, 0], drag)
+    assert bool((slope != 0).any())
+
+
+def test_a_step_of_ones_own_contacts_is_taken():
+    class Still(BoundMechanics):
+        def step(self, state, dt):
+            return state.replace(position=state.position + 1.0)
+
+    class Own(tf.Mechanics):
+        def bind(self, binding):
+            return (Still(self, binding),)
+
+    model = tf.Scene(tf.Growth(rate=1.0), Own(dim=2)).bind()
+    assert not any(isinstance(part, JoinedStep) for part in model._parts)
+    state = model.start()
+    assert torch.equal(model.step(state).position, state.position + 1.0)

@@ -16,13 +16,12 @@ import torch
 
 from torchfilm.effect import BoundEffect, Effect
 from torchfilm.effects.bound_mechanics import BoundMechanics
-from torchfilm.effects.growth import Growth
+from torchfilm.effects.growth import Growth, wanted_elongation
+from torchfilm.effects.mechanics import Mechanics
 from torchfilm.state import State
 from torchfilm.tools.numba_calls import as_array
+from torchfilm.tools.tangents import tracked
 from torchfilm.tools.timing import Timings
-
-# radii at the caps that grow with the length, where the volume grows evenly
-CAPS = 4.0 / 3.0
 
 
 class JoinedStep:
@@ -49,19 +48,20 @@ class JoinedStep:
 
     def _lengthened(self, state: State, dt: float) -> tuple[np.ndarray, np.ndarray] | None:
         """How much longer cells become and how long they then are, (N,), as `Growth` has it; None
-        where there are no cells, a derivative is wanted, or one would be of no finite length."""
-        rate, dtype = state.fields["growth_rate"], state.dtype
-        derivative = rate.requires_grad and torch.is_grad_enabled()
-        if not state.cells or derivative or self.mechanics.derivatives_wanted(state):
+        where there are no cells, a derivative is wanted, numbers are not of one type, or a cell
+        would be of no finite length."""
+        fields, dtype = state.fields, state.dtype
+        rate = fields["growth_rate"]
+        one_type = rate.dtype == state.radius.dtype == dtype
+        if not state.cells or not one_type or "elongation" not in fields:
+            return None
+        if tracked(rate) or self.mechanics.derivatives_wanted(state):
             return None
         wanted = rate * dt
-        growth = as_array(wanted if self.law == "linear" else torch.expm1(wanted), dtype)
-        length = as_array(state.length, dtype)
+        relative = as_array(wanted if self.law == "linear" else torch.expm1(wanted), dtype)
+        length, radius = as_array(state.length, dtype), as_array(state.radius, dtype)
         with np.errstate(all="ignore"):
-            if self.law == "volume":
-                growth = growth * (length + as_array(state.radius, dtype) * CAPS)
-            elif self.law == "length":
-                growth = growth * length
+            growth = wanted_elongation(self.law, relative, length, radius)
             after = length + growth
         return (growth, after) if after.max() < math.inf else None
 
@@ -75,6 +75,7 @@ def joined(effects: Sequence[BoundEffect]) -> list[BoundEffect | JoinedStep]:
             isinstance(before, BoundEffect)
             and _grows_plainly(before.effect)
             and isinstance(effect, BoundMechanics)
+            and (type(effect), type(effect.effect)) == (BoundMechanics, Mechanics)
             and effect.compiled
         ):
             found[-1] = JoinedStep(before, effect)
@@ -84,5 +85,5 @@ def joined(effects: Sequence[BoundEffect]) -> list[BoundEffect | JoinedStep]:
 
 
 def _grows_plainly(effect: Effect) -> bool:
-    """Whether the field growth_rate alone tells how cells grow."""
+    """Whether the field growth_rate alone tells how cells grow. Subclasses may do as they like."""
     return type(effect) is Growth and not effect.by_type

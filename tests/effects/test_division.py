@@ -375,6 +375,7 @@ def test_fields_of_any_type_divide_alike_by_kernels_and_by_torch(called, dtype, 
         tf.Field("mark", "whole numbers, two a cell", shape=(2,), dtype=torch.int64),
         tf.Field("age", "steps", dtype=torch.int32, initial=7, at_division="reset"),
         tf.Field("new", "yes or no", dtype=torch.bool, initial=True, at_division="reset"),
+        tf.Field("half", "yes or no", dtype=torch.bool, initial=0.5, at_division="reset"),
         tf.Field("single", "one type for all", dtype=torch.float32, initial=0.1,
                  at_division="reset"),
         tf.Field("matrix", "three by two", shape=(3, 2), initial=2.5, at_division="reset"),
@@ -395,10 +396,46 @@ def test_fields_of_any_type_divide_alike_by_kernels_and_by_torch(called, dtype, 
     bound = next(e for e in model.effects if e.title == "division")
     assert (bound._fresh(state) is None) == called
     by_kernels = bound.step(state, 0.1)
-    for module in (division, compiled_division):
-        monkeypatch.setattr(module, "kernels_loaded", lambda value: False)
+    monkeypatch.setattr(compiled_division, "kernels_loaded", lambda value: False)
     by_torch = bound.step(state, 0.1)
     assert by_kernels.cells == 6
     assert_same_state(by_kernels, by_torch)
     assert by_kernels.age.tolist() == [7] * 6 and bool(by_kernels.new.all())
     assert by_kernels.mark[0].tolist() == by_kernels.mark[1].tolist() == [-(2**40), 1 - 2**40]
+
+
+class NeverDue(tf.Division):
+    def due(self, state):
+        return torch.zeros_like(state.divide_flag)
+
+
+class Never(tf.Division):
+    def step(self, state, dt, values):
+        return state
+
+
+@pytest.mark.parametrize("kind", [NeverDue, Never])
+def test_a_division_of_ones_own_decides_for_itself(kind):
+    """Whether numba has been loaded or not."""
+    model = tf.Scene(tf.Growth(rate=1.0), kind(length=3.0)).bind()
+    state = model.start()
+    for _ in range(40):
+        state = model.step(state, 0.1)
+    assert state.cells == 1 and float(state.length) > 10
+
+
+@pytest.mark.parametrize("other", [torch.float32, torch.float64])
+def test_thresholds_of_another_type_than_lengths_stay_numbers(other, dtype):
+    """An effect of the user's may write them so; draws for daughters are of the column's type."""
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.0, 3.2)))
+    state = scene.bind(dtype=dtype).start()
+    state = state.with_fields(division_threshold=torch.full((1,), 3.1, dtype=other)).replace(
+        length=torch.full((1,), 3.5, dtype=dtype)
+    )
+    bound = next(e for e in scene.bind(dtype=dtype).effects if e.title == "division")
+    if other == dtype:
+        found = bound.step(state, 0.1).division_threshold
+        assert bool(((found >= 3.0) & (found <= 3.2)).all()) and found.numel() == 2
+    else:  # as by torch: nothing is converted unasked
+        with pytest.raises(RuntimeError, match="dtype"):
+            bound.step(state, 0.1)

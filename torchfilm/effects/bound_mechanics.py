@@ -48,6 +48,8 @@ class BoundMechanics(BoundEffect):
         surfaces = [s for wall in self.walls for s in wall.surfaces(effect.dim)]
         entries = [tensor for surface in surfaces for tensor in _tensors(surface)]
         self.needs_gradient = self.values.requires_grad or any(x.requires_grad for x in entries)
+        drawn = (v.field for v in vars(self.values).values() if v is not None)
+        self.fields = (*FIELDS, *(name for name in drawn if name is not None))
         dtype, values = binding.batch.dtype, self.values
         self.drags = [_same(values[n], dtype) for n in ("viscosity", "length_drag")]
         follows = self.compiled and effect.alpha is None and effect.stiffness is None
@@ -63,7 +65,8 @@ class BoundMechanics(BoundEffect):
         if not self.derivatives_wanted(state) and self.compiled:
             length, growth = state.length, state.fields.get("elongation")
             growth = torch.zeros_like(length) if growth is None else growth
-            return self.parted(state, dt, *(as_array(x, state.dtype) for x in (growth, length)))
+            dtype = state.radius.dtype
+            return self.parted(state, dt, *(as_array(x, dtype) for x in (growth, length)))
         found = torch_step.step(self._given(state, dt))
         fields = {
             **state.fields, "displacement": found.move, "collapsed_steps": found.collapsed
@@ -81,8 +84,8 @@ class BoundMechanics(BoundEffect):
     @torch.no_grad()
     def parted(self, state: State, dt: float, growth: np.ndarray, length: np.ndarray) -> State:
         """The state after a step by kernels, of at least one cell. length: (N,) µm after growth,
-        and growth: (N,) µm in this step, of the state's type; the state's own do not count."""
-        fields, one_sided, dtype = state.fields, self.effect.one_sided, state.dtype
+        and growth: (N,) µm in this step, of the type of its radii; its own do not count."""
+        fields, one_sided, dtype = state.fields, self.effect.one_sided, state.radius.dtype
         axis, radius, move = (
             as_array(x, dtype) for x in (state.axis, state.radius, fields["displacement"])
         )
@@ -121,7 +124,7 @@ class BoundMechanics(BoundEffect):
         return (
             self.needs_gradient
             or any(getattr(state, n).requires_grad for n in PARTS)
-            or any(fields[n].requires_grad for n in FIELDS if n in fields)
+            or any(fields[n].requires_grad for n in self.fields if n in fields)
         )
 
     def _refuse_tangents(self, state: State) -> None:
@@ -136,11 +139,12 @@ class BoundMechanics(BoundEffect):
 
     def _drags(self, state: State) -> tuple[np.ndarray, ...]:
         """Viscosity and length drag, (N,) or (1,), and their factor (N,) or (0,)."""
+        dtype = state.radius.dtype
         own = (
-            compiled.array_or_none(self.values[n].of_cells(state), state.dtype) if x is None else x
+            compiled.array_or_none(self.values[n].of_cells(state), dtype) if x is None else x
             for n, x in zip(("viscosity", "length_drag"), self.drags, strict=True)
         )
-        return *own, compiled.array_or_none(state.fields.get("drag"), state.dtype)
+        return *own, compiled.array_or_none(state.fields.get("drag"), dtype)
 
     def _alphas(self, state: State) -> tuple[int, np.ndarray]:
         if self.alphas is not None:
@@ -149,7 +153,7 @@ class BoundMechanics(BoundEffect):
             None if value is None else value.of_cells(state)
             for value in (self.values.alpha, self.values.stiffness)
         )
-        return compiled.alpha_arrays(alpha, stiffness, state.dtype)
+        return compiled.alpha_arrays(alpha, stiffness, state.radius.dtype)
 
     def _given(self, state: State, dt: float) -> MechanicsInput:
         fields, values = state.fields, self.values

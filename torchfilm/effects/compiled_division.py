@@ -14,7 +14,7 @@ from torchfilm.resolver import Resolved
 from torchfilm.state import CELL, State
 from torchfilm.tools.numba_calls import as_array, column_types, kernels_loaded
 from torchfilm.tools.random import counters
-from torchfilm.tools.tangents import tracked
+from torchfilm.tools.tangents import has_tangent, tracked
 
 IDS = ("colony", "uid", "parent", "next_uid", "stream")  # as `kernels.divisions.divide` takes them
 MADE = ("uid", "parent", "next_uid", "position", "axis", "length")  # and what it returns
@@ -42,23 +42,41 @@ def evenly_drawn(value: Resolved | None) -> Drawn | None:
     if kind is not None or isinstance(part, Resolved) or type(part[0]) is not Uniform:
         return None
     low, high = (part[1][name].value for name in Uniform.parameters)
-    if any(x is None or x.dim() or x.requires_grad for x in (low, high)):
+    if any(x is None or x.dim() or x.requires_grad or has_tangent(x) for x in (low, high)):
         return None
     return value.name, float(low), float(high)
 
 
-def due_rows(state: State, size: Tensor | None) -> tuple[Tensor, int]:
-    """The rows (M,) of the cells that divide, and how many of them are too short: see
-    `kernels.divisions.due_rows`. size: (N,) or None."""
+def known_number(initial: float, dtype: torch.dtype) -> float | None:
+    """A first value as kernels write it into a column of this type; None if that is not certain."""
+    if dtype == torch.bool:
+        return float(bool(initial))
+    number = float(initial)
+    exact = dtype.is_floating_point or (number.is_integer() and abs(number) < 2**31)
+    return number if exact and number == initial else None
+
+
+def knows_due(state: State, size: Tensor | None) -> bool:
+    """Whether kernels find the cells that are due as torch does: all numbers are of one type."""
+    given = [state.length, state.radius]
+    if size is not None:
+        given += [size, state.fields["division_threshold"]]
+    flag = state.fields["divide_flag"].dtype == torch.bool
+    return flag and kernels_loaded(state.length) and all(x.dtype == state.dtype for x in given)
+
+
+def due_rows(state: State, size: Tensor | None) -> tuple[Tensor | None, int]:
+    """The rows (M,) of the cells that divide, None for none, and how many of them are too short:
+    see `kernels.divisions.due_rows`. size: (N,), or None where there is no threshold."""
     from torchfilm.kernels import divisions
 
-    fields, dtype = state.fields, state.dtype
-    none = size is None
-    size = state.length[:0] if size is None else size
-    given = size, size if none else fields["division_threshold"], state.length, state.radius
+    fields, none = state.fields, state.length[:0]
+    given = none, none, state.length, state.radius
+    if size is not None:
+        given = size, fields["division_threshold"], state.length, state.radius
     flag = as_array(fields["divide_flag"], torch.bool)
-    rows, short = divisions.due_rows(flag, *(as_array(x, dtype) for x in given))
-    return torch.from_numpy(rows), short
+    rows, short = divisions.due_rows(flag, *(as_array(x, state.dtype) for x in given))
+    return (torch.from_numpy(rows) if len(rows) else None), short
 
 
 def divided(

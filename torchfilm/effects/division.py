@@ -11,12 +11,19 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import DIVISION, Binding, BoundEffect, Effect
-from torchfilm.effects.compiled_division import Drawn, can_divide, divided, due_rows, evenly_drawn
+from torchfilm.effects.compiled_division import (
+    Drawn,
+    can_divide,
+    divided,
+    due_rows,
+    evenly_drawn,
+    known_number,
+    knows_due,
+)
 from torchfilm.physics import capsule
 from torchfilm.resolver import Resolved, Values
 from torchfilm.state import CELL, Births, Ended, Field, State
 from torchfilm.tools import checks
-from torchfilm.tools.numba_calls import kernels_loaded
 from torchfilm.tools.ragged import offsets, repeated
 from torchfilm.tools.reads import numbers, rows_where
 from torchfilm.tools.vectors import nearest_root
@@ -202,7 +209,11 @@ class Division(Effect):
         return least, most
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
-        return (_BoundDivision(self, binding),)
+        # a subclass may have rules of its own, which kernels do not know
+        own = any(getattr(type(self), n) is not getattr(Division, n) for n in ("due", "step"))
+        bound = BoundEffect(self, binding) if own else _BoundDivision(self, binding)
+        bound.stage = binding.division_stage
+        return (bound,)
 
     def numerics(self, dt: float, state: State) -> list[str]:
         if self.criterion is None:
@@ -220,6 +231,9 @@ class Division(Effect):
         size, flag = self.size(state), state.fields["divide_flag"]
         return flag if size is None else flag | (size >= state.fields["division_threshold"])
 
+    def step(self, state: State, dt: float, values: Values) -> State:
+        return _divided_where_due(state, *_due_by_torch(self, state), values, None)
+
 
 class _BoundDivision(BoundEffect):
     """Division with what kernels need to know of its threshold."""
@@ -228,45 +242,61 @@ class _BoundDivision(BoundEffect):
 
     def __init__(self, effect: Division, binding: Binding):
         super().__init__(effect, binding)
-        self.stage = binding.division_stage
         name = effect.criterion
         self.drawn = None if name is None else evenly_drawn(self.values[name])
 
     def step(self, state: State, dt: float) -> State:
-        with torch.no_grad():
-            rows, some_short = self._due(state)
-            if rows is None:
-                return state
-            if some_short:
-                state, rows = _without_short(state, rows)
-                if not rows.numel():
-                    return state
-        return divide(state, rows, self.values.fraction, self.values.axis_noise, self._fresh(state))
-
-    def _due(self, state: State) -> tuple[Tensor | None, int]:
-        """The rows of the cells that divide, None for none; and whether some are too short."""
-        if kernels_loaded(state.length):
-            rows, count = due_rows(state, self.effect.size(state))
-            return (rows if rows.numel() else None), count
-        due = self.effect.due(state)
-        short = due & (state.length < 2 * state.radius)
-        some_due, some_short = numbers(due.any(), short.any())
-        return (rows_where(due)[0] if some_due else None), some_short
+        size = self.effect.size(state)
+        if knows_due(state, size):
+            rows, some_short = due_rows(state, size)
+        else:
+            rows, some_short = _due_by_torch(self.effect, state)
+        if rows is None:
+            return state
+        return _divided_where_due(state, rows, some_short, self.values, self._fresh(state))
 
     def _fresh(self, state: State) -> dict[str, float | Drawn] | None:
         """With what daughters begin in the fields that a division resets, if all do so by numbers
-        or by even draws."""
+        or by even draws that kernels know."""
         found: dict[str, float | Drawn] = {}
         for name, field in state.declared.items():
             if field.scope != CELL or field.at_division != "reset":
                 continue
+            begin: float | Drawn | None = None
             if not callable(field.initial):
-                found[name] = float(field.initial)
-            elif self.drawn and isinstance(getattr(field.initial, "initial", 0), _FirstThreshold):
-                found[name] = self.drawn
-            else:
+                begin = known_number(field.initial, state.fields[name].dtype)
+            elif isinstance(getattr(field.initial, "initial", 0), _FirstThreshold):
+                begin = self.drawn if state.fields[name].dtype == state.dtype else None
+            if begin is None:
                 return None
+            found[name] = begin
         return found
+
+
+def _due_by_torch(division: Division, state: State) -> tuple[Tensor | None, int]:
+    """The rows of the cells that divide, None for none; and whether some are too short."""
+    with torch.no_grad():
+        due = division.due(state)
+        short = due & (state.length < 2 * state.radius)
+        some_due, some_short = numbers(due.any(), short.any())
+        return (rows_where(due)[0] if some_due else None), some_short
+
+
+def _divided_where_due(
+    state: State,
+    rows: Tensor | None,
+    some_short: int,
+    values: Values,
+    fresh: Mapping[str, float | Drawn] | None,
+) -> State:
+    """The state in which the cells `rows` are divided, but those of colonies in which one is too
+    short. fresh: as `divide` has it."""
+    if rows is not None and some_short:
+        with torch.no_grad():
+            state, rows = _without_short(state, rows)
+    if rows is None or not rows.numel():
+        return state
+    return divide(state, rows, values.fraction, values.axis_noise, fresh)
 
 
 def _pixels_hint(length: float, radius: float) -> str:

@@ -130,14 +130,10 @@ class Growth(Effect):
     def step(self, state: State, dt: float, values: Values) -> State:
         if self.by_type:
             state = state.with_fields(growth_rate=values.rate.of_cells(state))
-        wanted = state.growth_rate * dt
-        if self.law == "volume":
-            # V = π r² (l + 4r/3), so l + 4r/3 grows like V
-            elongation = torch.expm1(wanted) * (state.length + state.radius * (4.0 / 3.0))
-        elif self.law == "length":
-            elongation = torch.expm1(wanted) * state.length
-        else:
-            elongation = wanted
+        relative = state.growth_rate * dt
+        if self.law != "linear":
+            relative = torch.expm1(relative)
+        elongation = wanted_elongation(self.law, relative, state.length, state.radius)
         length = state.length + elongation
         # one look at the longest: NaN is the largest of all
         if state.cells and not length.max().item() < math.inf:
@@ -199,6 +195,15 @@ class _BoundGrowth(BoundEffect):
                 + ", or let the later one read growth_rate and change it (an effect of your own"
                 " names what it reads in reads())."
             )
+
+
+def wanted_elongation(law: str, relative: Any, length: Any, radius: Any) -> Any:
+    """How much longer cells become, (N,) µm, as tensors or arrays. relative: (N,) growth of what
+    the law lets grow evenly; by "linear" in µm."""
+    if law == "volume":
+        # V = π r² (l + 4r/3), so l + 4r/3 grows like V
+        return relative * (length + radius * (4.0 / 3.0))
+    return relative * length if law == "length" else relative
 
 
 def _first_rate(state: State, rows: Tensor, values: Values) -> Tensor:

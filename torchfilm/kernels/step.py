@@ -251,7 +251,7 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
         if number > 0 and not deeply:  # cells do not lie deep in others; but in a wall?
             if deepest >= -deep:
                 break
-            found, deeply = _contacts_of(x, axis, half, radius, margin, found, dof), True
+            found, deeply = _contacts(x, axis, half, radius, margin, dof), True
             continue
         numbers, count, mine = _deep_cells(found, rows, at_walls, deep, len(y) * (number > 0))
         m = pair_rows(x, axis, half, radius, scale, mine, at_walls, rows, margin, dof)
