@@ -208,7 +208,7 @@ def test_who_computes_contacts_is_who_is_reported(backend, contacts, monkeypatch
     for name, part in parts.items():
         function = "step" if name == "compiled" else "contact_steps"
         usual = getattr(part, function)
-        steps = lambda given, name=name, usual=usual: called.append(name) or usual(given)
+        steps = lambda *given, name=name, usual=usual: called.append(name) or usual(*given)
         monkeypatch.setattr(part, function, steps)
     effect = tf.Mechanics(dim=2, backend=backend, contacts=contacts)
     model = tf.Scene(effect, tf.Growth(rate=1.0)).bind()

@@ -8,8 +8,8 @@ same bits.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 
 import numpy as np
 import torch
@@ -33,18 +33,15 @@ class JoinedStep:
 
     def run_step(self, state: State, dt: float, timings: Timings | None) -> State:
         """The state after growth and contacts."""
-        begin = time.perf_counter()
-        found = self._lengthened(state, dt)
-        grown = self.growth.run_step(state, dt) if found is None else state
-        between = time.perf_counter()
-        if found is None:
-            state = self.mechanics.run_step(grown, dt)
-        else:
-            state = self.mechanics.parted(state, dt, *found)
-        if timings is not None:
-            timings.add(self.growth.title, between - begin)
-            timings.add(self.mechanics.title, time.perf_counter() - between)
-        return state
+        of = lambda effect: timings.of(effect.title, state.device) if timings else nullcontext()
+        with of(self.growth):
+            found = self._lengthened(state, dt)
+            if found is None:
+                state = self.growth.run_step(state, dt)
+        with of(self.mechanics):
+            if found is None:
+                return self.mechanics.run_step(state, dt)
+            return self.mechanics.parted(state, dt, *found)
 
     def _lengthened(self, state: State, dt: float) -> tuple[np.ndarray, np.ndarray] | None:
         """How much longer cells become and how long they then are, (N,), as `Growth` has it; None

@@ -297,19 +297,25 @@ class State:
             )
         return declared.with_fields(**{field.name: start})
 
-    def take(self, index: Tensor) -> State:
+    def cell_columns(self) -> dict[str, Tensor]:
+        """All that cells have, by name: for what copies a state as a whole, whatever it holds."""
+        fields = {n: x for n, x in self.fields.items() if self.declared[n].scope == CELL}
+        return {name: getattr(self, name) for name in PER_CELL} | fields
+
+    def take(self, index: Tensor, **known: Tensor) -> State:
         """The cells at `index` (M,), which keeps colonies side by side; colonies stay, if need be
-        empty."""
+        empty. known: parts that these cells have already, such as `length`."""
         row_checks.check_rows("index", index, self.cells)
         try:
             fields = {
                 name: value.index_select(0, index) if self.declared[name].scope == CELL else value
                 for name, value in self.fields.items()
             }
-            part = {name: getattr(self, name).index_select(0, index) for name in PER_CELL}
+            left = [name for name in PER_CELL if name not in known]
+            part = {name: getattr(self, name).index_select(0, index) for name in left}
         except IndexError as error:
             raise row_checks.out_of_range("index", index, self.cells) from error
-        return self.replace(**part, fields=fields)
+        return self.replace(**part, **known, fields=fields)
 
     def reset_at_division(self, daughters: Tensor, names: Iterable[str]) -> State:
         """The state right after divisions (`births[-1]` tells of them) in which those of the named

@@ -89,6 +89,9 @@ class RecordingState(State):
     def take(self, index: torch.Tensor, **known: torch.Tensor) -> State:
         return RecordingState.of(self.plain().take(index, **known), self.log)
 
+    def cell_columns(self) -> dict[str, torch.Tensor]:
+        return self.plain().cell_columns()
+
     def reset_at_division(self, daughters: torch.Tensor, names: Any) -> State:
         # the fields' own rules read here, not the effect that divides
         self.log.quiet = True

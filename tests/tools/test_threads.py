@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import torchfilm as tf
+from torchfilm.effects.bound_mechanics import BoundMechanics
 from torchfilm.tools import threads
 
 
@@ -99,13 +100,13 @@ def test_a_rule_has_the_threads_of_torch_and_kernels_leave_it_one(monkeypatch):
         seen["rule"] = torch.get_num_threads()
         return {"growth_rate": cells.growth_rate}
 
-    step = tf.Growth.step
+    parted = BoundMechanics.parted
 
     def spied(self, *given):
-        seen["growth"] = torch.get_num_threads()
-        return step(self, *given)
+        seen["mechanics"] = torch.get_num_threads()
+        return parted(self, *given)
 
-    monkeypatch.setattr(tf.Growth, "step", spied)
+    monkeypatch.setattr(BoundMechanics, "parted", spied)
     scene = tf.Scene(tf.Rules(rule), tf.Growth(rate=1.0), tf.Mechanics())
     model = scene.bind()
     for inside in (False, True):
@@ -115,7 +116,7 @@ def test_a_rule_has_the_threads_of_torch_and_kernels_leave_it_one(monkeypatch):
                 model.step(model.start())
         else:
             model.step(model.start())
-        assert seen == {"rule": 3, "growth": 1}
+        assert seen == {"rule": 3, "mechanics": 1}
         assert torch.get_num_threads() == 3
 
 

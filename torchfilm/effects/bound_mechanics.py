@@ -68,16 +68,14 @@ class BoundMechanics(BoundEffect):
             dtype = state.radius.dtype
             return self.parted(state, dt, *(as_array(x, dtype) for x in (growth, length)))
         found = torch_step.step(self._given(state, dt))
-        fields = {
-            **state.fields, "displacement": found.move, "collapsed_steps": found.collapsed
-        }  # fmt: skip
-        if "elongation" in fields:
+        fields = {"displacement": found.move, "collapsed_steps": found.collapsed}
+        if "elongation" in state.fields:
             fields["elongation"] = found.elongation
         if found.contact_alpha is not None and found.compression is not None:
             fields |= {"contact_alpha": found.contact_alpha, "compression": found.compression}
         report = MechanicsReport(**vars(found.report), substeps=found.substeps)
-        return state.replace(
-            position=found.position, axis=found.axis, length=found.length, fields=fields,
+        return state.with_fields(**fields).replace(
+            position=found.position, axis=found.axis, length=found.length,
             reports={**state.reports, "mechanics": report},
         )  # fmt: skip
 
@@ -103,14 +101,14 @@ class BoundMechanics(BoundEffect):
             self._alphas(state), walls,
         )  # fmt: skip
         x, axes, lengths, moves, growths, fallen, *of_contacts = map(torch.from_numpy, made)
-        new = {**fields, "displacement": moves, "collapsed_steps": fallen}
+        new = {"displacement": moves, "collapsed_steps": fallen}
         if "elongation" in fields:
             new["elongation"] = growths
         if one_sided:
             new["contact_alpha"], new["compression"] = of_contacts
         of_step = MechanicsReport(**vars(report), substeps=substeps)
-        return state.replace(
-            position=x, axis=axes, length=lengths, fields=new,
+        return state.with_fields(**new).replace(
+            position=x, axis=axes, length=lengths,
             reports={**state.reports, "mechanics": of_step},
         )  # fmt: skip
 

@@ -11,13 +11,14 @@ from torch import Tensor
 
 from torchfilm.distributions import Uniform
 from torchfilm.resolver import Resolved
-from torchfilm.state import CELL, State
+from torchfilm.state import State
 from torchfilm.tools.numba_calls import as_array, column_types, kernels_loaded
 from torchfilm.tools.random import counters
 from torchfilm.tools.tangents import has_tangent, tracked
 
 IDS = ("colony", "uid", "parent", "next_uid", "stream")  # as `kernels.divisions.divide` takes them
 MADE = ("uid", "parent", "next_uid", "position", "axis", "length")  # and what it returns
+MADE_OF_CELLS = frozenset(MADE)
 KEPT = ("colony", "radius")  # what daughters have as their parents, beside the fields
 # With what daughters begin: a number, or an even draw: its purpose, low, high.
 Drawn = tuple[str, float, float]
@@ -28,7 +29,7 @@ def can_divide(state: State, share: Tensor, axis_noise: Resolved) -> bool:
     known to them."""
     if not kernels_loaded(share) or axis_noise.value is None or axis_noise.types is not None:
         return False
-    given = (state.position, state.axis, state.length, state.radius, *state.fields.values())
+    given = state.cell_columns().values()
     types = column_types()
     return all(x.dtype in types for x in given) and not tracked(*given, share, axis_noise.value)
 
@@ -87,9 +88,8 @@ def divided(
     with what daughters begin in some of the fields; in the others with what their parents have."""
     from torchfilm.kernels import divisions
 
-    fields, declared = state.fields, state.declared
-    columns = {n: x.contiguous() for n, x in fields.items() if declared[n].scope == CELL}
-    columns |= {n: getattr(state, n).contiguous() for n in KEPT}
+    every = state.cell_columns()
+    columns = {n: x.contiguous() for n, x in every.items() if n not in MADE_OF_CELLS}
     total, types = state.cells + rows.numel(), column_types()
     new = {n: torch.empty((total, *x.shape[1:]), dtype=x.dtype) for n, x in columns.items()}
     noise_key = counters(state.seed, state.step, "Division.axis_noise")
@@ -119,5 +119,5 @@ def divided(
     )  # fmt: skip
     found = zip(MADE, map(torch.from_numpy, (*of_ids, *of_cells)), strict=True)
     kept = {n: new.pop(n) for n in KEPT}
-    made = state.replace(**dict(found), **kept, fields={**fields, **new})
+    made = state.replace(**dict(found), **kept).with_fields(**new)
     return made, torch.from_numpy(daughters)

@@ -259,14 +259,15 @@ class _BoundDivision(BoundEffect):
         """With what daughters begin in the fields that a division resets, if all do so by numbers
         or by even draws that kernels know."""
         found: dict[str, float | Drawn] = {}
+        columns = state.cell_columns()
         for name, field in state.declared.items():
             if field.scope != CELL or field.at_division != "reset":
                 continue
             begin: float | Drawn | None = None
             if not callable(field.initial):
-                begin = known_number(field.initial, state.fields[name].dtype)
+                begin = known_number(field.initial, columns[name].dtype)
             elif isinstance(getattr(field.initial, "initial", 0), _FirstThreshold):
-                begin = self.drawn if state.fields[name].dtype == state.dtype else None
+                begin = self.drawn if columns[name].dtype == state.dtype else None
             if begin is None:
                 return None
             found[name] = begin

@@ -145,7 +145,7 @@ class Growth(Effect):
                 state.replace(reports={**state.reports, "growth": report}),
                 state.length + elongation,
             )
-        return state.replace(length=length, fields={**state.fields, "elongation": elongation})
+        return state.replace(length=length).with_fields(elongation=elongation)
 
 
 class _BoundGrowth(BoundEffect):

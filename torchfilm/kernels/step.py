@@ -254,7 +254,8 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
             found, deeply = _contacts(x, axis, half, radius, margin, dof), True
             continue
         numbers, count, mine = _deep_cells(found, rows, at_walls, deep, len(y) * (number > 0))
-        m = pair_rows(x, axis, half, radius, scale, mine, at_walls, rows, margin, dof)
+        far = 0.0 if settings[SOFT] > 0 else margin  # more rows would make soft cells stiffer
+        m = pair_rows(x, axis, half, radius, scale, mine, at_walls, rows, far, dof)
         error, e = _minimise_some(
             rows, m, numbers, count, alpha, low, y, 2 * target, settings, report, team, dof
         )

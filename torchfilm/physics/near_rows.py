@@ -20,11 +20,11 @@ from torchfilm.physics.stretches import stretch_of
 from torchfilm.tools.reads import rows_where
 
 
-def near_rows(pairs: CandidateContacts, margin: Tensor) -> Contacts:
+def near_rows(pairs: CandidateContacts, margin: Tensor | None) -> Contacts:
     """The rows of all pairs, gaps as they are: one at the closest points, or, where two cells touch
     along a line, two of weight ½ at its ends. And in space one of weight ½ at each end of the
     stretch along which two cells lie side by side, where it is far from those and nearer than
-    `margin` (K,)."""
+    `margin` (K,); None: nowhere, for soft cells, which more rows would make stiffer."""
     a, b, s, t = pairs.a, pairs.b, pairs.s, pairs.t
     flat = pairs.flat
     *of_lines, line = line_points(
@@ -37,7 +37,7 @@ def near_rows(pairs: CandidateContacts, margin: Tensor) -> Contacts:
     one = torch.ones_like(s, dtype=torch.bool)
     two = torch.zeros_like(one).index_copy(0, flat, line)
     marks, ends = [one, two], [x.new_empty(0, x.shape[1]) for x in points]
-    if a.axis.shape[0] == 3:
+    if margin is not None and a.axis.shape[0] == 3:
         along = stretch_of(a, b)
         ends = list(along.points)
         with torch.no_grad():

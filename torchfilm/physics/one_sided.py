@@ -179,7 +179,8 @@ class _OneStep:
         their moves."""
         given, settings = self.given, self.given.settings
         owner = self.groups.owner.index_select(0, pairs.first)
-        contacts = near_rows(pairs, MARGIN * self.wide.index_select(0, owner))
+        margin = MARGIN * self.wide.index_select(0, owner)
+        contacts = near_rows(pairs, None if settings.soft else margin)
         solved = self._solved(at, contacts, walls, moving, cells, active, least, first_pass)
         part, end = solved.problem, solved.end
         y = self._with_gradient(part, end)

@@ -27,8 +27,4 @@ class Timings:
         yield
         if device.type == "cuda":
             torch.cuda.synchronize(device)
-        self.add(name, time.perf_counter() - start)
-
-    def add(self, name: str, seconds: float) -> None:
-        """Add seconds to `name`."""
-        self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
