@@ -299,23 +299,20 @@ class State:
 
     def cell_columns(self) -> dict[str, Tensor]:
         """All that cells have, by name: for what copies a state as a whole, whatever it holds."""
-        fields = {n: x for n, x in self.fields.items() if self.declared[n].scope == CELL}
-        return {name: getattr(self, name) for name in PER_CELL} | fields
+        own = {name: getattr(self, name) for name in PER_CELL}
+        return own | {n: x for n, x in self.fields.items() if self.declared[n].scope == CELL}
 
     def take(self, index: Tensor, **known: Tensor) -> State:
         """The cells at `index` (M,), which keeps colonies side by side; colonies stay, if need be
         empty. known: parts that these cells have already, such as `length`."""
         row_checks.check_rows("index", index, self.cells)
+        columns = {n: x for n, x in self.cell_columns().items() if n not in known}
         try:
-            fields = {
-                name: value.index_select(0, index) if self.declared[name].scope == CELL else value
-                for name, value in self.fields.items()
-            }
-            left = [name for name in PER_CELL if name not in known]
-            part = {name: getattr(self, name).index_select(0, index) for name in left}
+            new = {name: x.index_select(0, index) for name, x in columns.items()}
         except IndexError as error:
             raise row_checks.out_of_range("index", index, self.cells) from error
-        return self.replace(**part, **known, fields=fields)
+        part = {name: new.pop(name) for name in PER_CELL if name in new}
+        return self.replace(**part, **known, fields={**self.fields, **new})
 
     def reset_at_division(self, daughters: Tensor, names: Iterable[str]) -> State:
         """The state right after divisions (`births[-1]` tells of them) in which those of the named
@@ -409,14 +406,11 @@ class State:
         return [n for n in self.fields if not self.declared[n].internal]
 
     def __repr__(self) -> str:
-        counts = (
-            f"{displays.counted(self.colonies, 'colony', 'colonies')},"
-            f" {displays.counted(self.cells, 'cell')}"
-        )
+        colonies = displays.counted(self.colonies, "colony", "colonies")
         return (
-            f"State({counts}, {self.dim}-D, t = {self.time:g} h, step {self.step},"
-            f" {str(self.dtype)[6:]} on {self.device}, fields:"
-            f" {', '.join(self._own_fields()) or 'none'})"
+            f"State({colonies}, {displays.counted(self.cells, 'cell')}, {self.dim}-D,"
+            f" t = {self.time:g} h, step {self.step}, {str(self.dtype)[6:]} on"
+            f" {self.device}, fields: {', '.join(self._own_fields()) or 'none'})"
         )
 
     def _repr_html_(self) -> str:

@@ -16,7 +16,8 @@ MARGIN, TOO_DEEP, OVERLAP = 0.6, 0.2, 0.014
 # rad makes overlaps of up to 0.12 µm, deeper than TOO_DEEP, and a squeezed cell would turn to and
 # fro, pass after pass. So the ends of the stretch along which they lie have rows of their own,
 # where they are farther than BEYOND radii from the contact and nearer than MARGIN. In the plane,
-# where an end of a cell is at the contact, its two rows foresee such a turn to 0.04 µm.
+# where an end of a cell is at the contact, its two rows foresee such a turn to 0.04 µm. Soft cells
+# have no such rows, which would make them stiffer.
 BEYOND = 0.5
 # The same in sub-steps: a colony that takes them is not seen between them.
 DEEP_IN_SUBSTEPS = 0.08

@@ -236,7 +236,7 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
     least = np.maximum(base - SHRINK * np.maximum(growth, 0.0), shortest)
     half, reach, root = 0.5 * length, np.empty_like(base), np.empty(roots.shape)
     alpha, low, y = np.empty_like(last[:, 0]), np.empty_like(last[:, 0]), np.empty_like(last)
-    at, is_soft = (walls, root, reach), walls[3]
+    at, is_soft, far = (walls, root, reach), walls[3], margin * (settings[SOFT] <= 0)
     number, deeply, softer, rising, kept, held, kept_alpha = 0, False, 1.0, True, y, 0.0, 0.0
     found = _contacts(x, axis, half, radius, margin, dof)
     report[DEEPLY] = 0 if settings[SOFT] > 0 else deeply_overlapping(found, radius)
@@ -254,7 +254,6 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
             found, deeply = _contacts(x, axis, half, radius, margin, dof), True
             continue
         numbers, count, mine = _deep_cells(found, rows, at_walls, deep, len(y) * (number > 0))
-        far = 0.0 if settings[SOFT] > 0 else margin  # more rows would make soft cells stiffer
         m = pair_rows(x, axis, half, radius, scale, mine, at_walls, rows, far, dof)
         error, e = _minimise_some(
             rows, m, numbers, count, alpha, low, y, 2 * target, settings, report, team, dof
