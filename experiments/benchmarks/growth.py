@@ -125,6 +125,7 @@ def product_over_copy(cells: int = 10000) -> dict[str, float]:
     lattice of touching cells in the plane."""
     from torchfilm.kernels import contacts, neighbours, solve
     from torchfilm.kernels.compiling import for_python
+    from torchfilm.kernels.memory import no_memory
 
     side, dof = round(cells**0.5), (0,) * 4
     grid = np.stack(np.meshgrid(np.arange(side) * 3.95, np.arange(side) * 0.99), -1)
@@ -132,8 +133,9 @@ def product_over_copy(cells: int = 10000) -> dict[str, float]:
     n = len(x)
     axis, half, radius = np.tile([1.0, 0.0], (n, 1)), np.full(n, 1.5), np.full(n, 0.5)
     scale = np.ones((n, 4))
-    first, second = for_python(neighbours.near_pairs)(x, axis, half, radius, 0.3, dof)
-    near = for_python(contacts.near_contacts)(x, axis, half, radius, first, second, 0.3, dof)
+    given = no_memory(), x, axis, half, radius
+    first, second = for_python(neighbours.near_pairs)(*given, 0.3, dof)
+    near = for_python(contacts.near_contacts)(*given, first, second, 0.3, dof)
     found = (first, second, *near)
     room = contacts.ROWS * len(near[0])
     H, gaps = np.empty((2 * room, 4), np.float32), np.empty(room, np.float32)

@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 
 from torchfilm.kernels import bilateral_solve, solve
 from torchfilm.kernels.compiling import for_python
+from torchfilm.kernels.memory import no_memory
 from torchfilm.physics import one_sided_solve
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.one_sided_solve import Minimum
@@ -145,8 +146,9 @@ class Problem:
             if applied_force is None:  # no row has pushed before
                 rows = (*rows[:-1], rows[-1][:0])
             iterations, error, _ = for_python(solve.minimise)(
-                *rows, alpha, low, cells, tolerance, np.inf, limit, np.zeros(0, np.int64), dof
-            )
+                no_memory(), *rows, alpha, low, cells, tolerance, np.inf, limit,
+                np.zeros(0, np.int64), dof,
+            )  # fmt: skip
             y[mine] = cells[:, : y.shape[1]]
             errors.append(error)
             counts.append(iterations)
@@ -161,7 +163,7 @@ class Problem:
             rigid = np.zeros(len(cells), dtype=bool)
             found.append(
                 for_python(bilateral_solve.minimise)(
-                    *rows, alpha, low, rigid, cells, tolerance, limit, dof
+                    no_memory(), *rows, alpha, low, rigid, cells, tolerance, limit, dof
                 )
             )
             y[mine] = cells[:, : y.shape[1]]

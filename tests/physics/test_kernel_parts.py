@@ -16,6 +16,7 @@ import torch
 import torchfilm as tf
 from torchfilm.kernels import colonies, contacts, functions, lanes, moves, neighbours
 from torchfilm.kernels.compiling import for_python
+from torchfilm.kernels.memory import no_memory
 from torchfilm.physics import substeps
 from torchfilm.physics.problem import BAD_DRAG, CONVERGED, NOT_FINITE, TOO_FAST
 from torchfilm.tools.ragged import Groups
@@ -124,7 +125,9 @@ def test_near_pairs_are_those_whose_boxes_meet(dim, count, apart):
     rng = np.random.default_rng(count)
     x, axis, half, radius = crowd(rng, count, dim)
     x[::2] += apart
-    first, second = for_python(neighbours.near_pairs)(x, axis, half, radius, 0.3, DOF[dim])
+    first, second = for_python(neighbours.near_pairs)(
+        no_memory(), x, axis, half, radius, 0.3, DOF[dim]
+    )
     side = np.abs(axis) * half[:, None] + radius[:, None] + 0.15
     away = (np.abs(x[:, None] - x[None]) - side[:, None] - side[None]).max(2)
     found = set(zip(first.tolist(), second.tolist(), strict=True))
@@ -142,8 +145,10 @@ def test_near_pairs_of_some_cells_are_those_of_all_that_have_one(dim, count, sha
     rng = np.random.default_rng(count)
     cells = crowd(rng, count, dim)
     some = (rng.random(count) < share).astype(np.uint8)
-    every = np.stack(for_python(neighbours.near_pairs)(*cells, 0.3, DOF[dim]), 1)
-    found = np.stack(for_python(neighbours.near_pairs_of)(*cells, 0.3, some, DOF[dim]), 1)
+    every = np.stack(for_python(neighbours.near_pairs)(no_memory(), *cells, 0.3, DOF[dim]), 1)
+    found = np.stack(
+        for_python(neighbours.near_pairs_of)(no_memory(), *cells, 0.3, some, DOF[dim]), 1
+    )
     wanted = every[(some[every] > 0).any(1)]
     assert set(map(tuple, found.tolist())) == set(map(tuple, wanted.tolist()))
     assert len(found) == len(wanted) and (np.diff(found[:, 0]) >= 0).all()
@@ -165,13 +170,13 @@ def test_no_cells_come_nearer_than_told(dim, spread, own):
     margin, every = 100.0, np.array(list(itertools.combinations(range(60), 2)), np.int32)
     first, second = every.T.copy()
     near_contacts = for_python(contacts.near_contacts)
-    gaps = lambda: near_contacts(x, axis, half, radius, first, second, margin, dof)[2]
+    gaps = lambda: near_contacts(no_memory(), x, axis, half, radius, first, second, margin, dof)[2]
     before, length = gaps(), 2 * half
     scale, least = np.ones_like(y), np.zeros(60)
     about = np.zeros_like(y)
     for_python(moves.move_cells)(x, axis, length, y, scale, about, 1e9, least, dof)
     half = 0.5 * length
-    (all_, each), after = for_python(moves.approach)(x, length, radius, y, dof), gaps()
+    (all_, each), after = for_python(moves.approach)(no_memory(), x, length, radius, y, dof), gaps()
     told = all_ + each[first] + each[second]
     near = before - all_ - 2 * each.max() < 0.3
     assert near.sum() > 50

@@ -5,16 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.memory import room, zeros
 from torchfilm.kernels.rows import degrees
 
 
 @kernel
-def cells_of(of, x, axis, last, roots, dof):
+def cells_of(memory, of, x, axis, last, roots, dof):
     """x and axis (n, d) in float64, last (n, len(dof)) and roots (S, n) of the cells `of`."""
     D = degrees(dof)
     n, d = of.shape[0], 2 if D == 4 else 3
-    own_x, own_axis = np.empty((n, d)), np.empty((n, d))
-    own_last, own_roots = np.zeros((n, len(dof)), last.dtype), np.empty((roots.shape[0], n))
+    own_x, own_axis = room(memory, (n, d), np.float64), room(memory, (n, d), np.float64)
+    own_last = zeros(memory, (n, len(dof)), last.dtype)
+    own_roots = room(memory, (roots.shape[0], n), np.float64)
     for i in range(n):
         for k in range(d):
             own_x[i, k], own_axis[i, k] = x[of[i], k], axis[of[i], k]

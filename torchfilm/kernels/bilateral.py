@@ -26,6 +26,7 @@ from torchfilm.kernels.colonies import (
 )
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.contacts import near_contacts, pair_rows
+from torchfilm.kernels.memory import TOP, give_back, room
 from torchfilm.kernels.moves import drags
 from torchfilm.kernels.neighbours import near_pairs, spatial_order
 from torchfilm.kernels.rows import STIFF, deeply_overlapping, degrees, rows_among, wall_rows
@@ -85,25 +86,25 @@ def _holding_rows(rows, walls, m, radius, hold, soft):
 
 
 @kernel
-def _contacts(x, axis, half, radius, hold, dof):
+def _contacts(memory, x, axis, half, radius, hold, dof):
     """Pairs that overlap, with `hold` also those that are near, and some more: see
     `near_contacts`."""
     margin = 2.0 * max(CANDIDATE, 0.5 * NEAR * hold) * radius.max()
-    first, second = near_pairs(x, axis, half, radius, margin, dof)
-    keep, points, gap = near_contacts(x, axis, half, radius, first, second, margin, dof)
+    first, second = near_pairs(memory, x, axis, half, radius, margin, dof)
+    keep, points, gap = near_contacts(memory, x, axis, half, radius, first, second, margin, dof)
     return first, second, keep, points, gap
 
 
 @kernel
-def _wall_contacts(x, axis, half, radius, scale, alpha, kinds, places, sizes, roots, is_soft, hold,
-                   overlap, found, left, like, dof):  # fmt: skip
+def _wall_contacts(memory, x, axis, half, radius, scale, alpha, kinds, places, sizes, roots,
+                   is_soft, hold, overlap, found, left, like, dof):  # fmt: skip
     """Rows of cells at walls, with room for those of the contacts `found`; how many there are.
     Marks in `left` the cells that lie too deep in a wall."""
     n, number = x.shape[0], 0
-    room = 2 * found[2].shape[0] + 3 * kinds.shape[0] * n
-    H, gaps = np.empty((2 * room, len(dof)), like.dtype), np.empty(room, like.dtype)
-    one, two = np.empty(room, np.int32), np.empty(room, np.int32)
-    soft = np.zeros(room, np.uint8)
+    most = 2 * found[2].shape[0] + 3 * kinds.shape[0] * n
+    H, gaps = room(memory, (2 * most, len(dof)), like.dtype), room(memory, (most,), like.dtype)
+    one, two = room(memory, (most,), np.int32), room(memory, (most,), np.int32)
+    soft = room(memory, (most,), np.uint8)
     for w in range(kinds.shape[0]):
         root = np.sqrt(roots[w] * alpha) if is_soft[w] else roots[w].copy()
         reach = NEAR * radius * (hold and not is_soft[w])
@@ -140,7 +141,7 @@ def _contacts_of(found, left):
 
 
 @kernel
-def _solved(rows, m, left, count, start, growth, alpha, low, tolerance, limit, again, dof):
+def _solved(memory, rows, m, left, count, start, growth, alpha, low, tolerance, limit, again, dof):
     """The scaled move (n, len(dof)) of the `count` marked cells among the others at rest, by the
     first m of the rows. again: whether soft rows have already pushed. Also iterations, error and
     status."""
@@ -155,8 +156,9 @@ def _solved(rows, m, left, count, start, growth, alpha, low, tolerance, limit, a
     which = np.flatnonzero(left)
     part, rigid = start[which], growth[which] <= 0
     iterations, error, status = minimise(
-        H, one, two, m, gaps, pushed, alpha[which], low[which], rigid, part, tolerance, limit, dof
-    )
+        memory, H, one, two, m, gaps, pushed, alpha[which], low[which], rigid, part, tolerance,
+        limit, dof,
+    )  # fmt: skip
     y = np.zeros_like(start)
     for p in range(count):
         for k in range(y.shape[1]):
@@ -165,9 +167,9 @@ def _solved(rows, m, left, count, start, growth, alpha, low, tolerance, limit, a
 
 
 @kernel
-def step_colony(x, axis, base, growth, radius, viscosity, length_drag, alpha, start, last, overlap,
-                kinds, places, sizes, roots, is_soft, passes, tolerance, limit, soft, report,
-                dof):  # fmt: skip
+def step_colony(memory, x, axis, base, growth, radius, viscosity, length_drag, alpha, start, last,
+                overlap, kinds, places, sizes, roots, is_soft, passes, tolerance, limit, soft,
+                report, dof):  # fmt: skip
     """Grow one colony by `growth` and part what overlaps, in up to `passes` passes; x and axis in
     place. Returns lengths.
 
@@ -178,20 +180,22 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, alpha, st
     n, end = base.shape[0], degrees(dof) - 1
     length, scale, grows = base + growth, np.zeros(last.shape), np.ones(n)
     left, clipped, y = np.ones(n, np.uint8), np.zeros(n, np.uint8), np.zeros_like(start)
+    top = memory[1][TOP]
     for number in range(passes):
+        give_back(memory, top)
         again = number > 0
         hold, half = again and not soft, 0.5 * length
         drags(length, radius, viscosity, length_drag, grows, scale, dof)
-        found = _contacts(x, axis, half, radius, hold, dof)
+        found = _contacts(memory, x, axis, half, radius, hold, dof)
         if again:
             for i in range(n):
                 left[i] = clipped[i]
             if not soft:
                 _mark_deep(found, overlap, left)
         elif not soft:
-            report[DEEPLY] = deeply_overlapping(found, radius)
+            report[DEEPLY] = deeply_overlapping(memory, found, radius)
         rows, walls = _wall_contacts(
-            x, axis, half, radius, scale, alpha, kinds, places, sizes, roots, is_soft, hold,
+            memory, x, axis, half, radius, scale, alpha, kinds, places, sizes, roots, is_soft, hold,
             overlap, found, left, last, dof,
         )  # fmt: skip
         count = int(left.sum())
@@ -207,7 +211,7 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, alpha, st
         m = _holding_rows(rows, walls, m, radius, hold, soft)
         low = ((base - length) / scale[:, end]).astype(last.dtype)
         y, iterations, error, status = _solved(
-            rows, m, left, count, y, growth, alpha, low, tolerance, limit, again, dof
+            memory, rows, m, left, count, y, growth, alpha, low, tolerance, limit, again, dof
         )
         report[ITERATIONS] += iterations
         report[PASSES] += 1
@@ -226,8 +230,8 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, alpha, st
 
 
 @kernel(entry=True)
-def step_colonies(taken, which, begin, dt, longest, cells, drags, alphas, walls, settings, out,
-                  reports, dof):  # fmt: skip
+def step_colonies(memory, taken, which, begin, dt, longest, cells, drags, alphas, walls, settings,
+                  out, reports, dof):  # fmt: skip
     """Steps of the colonies `which`, each by itself: `kernels.colonies` describes the arguments."""
     soft, limit, x, radius = settings[SOFT] > 0, int(settings[LIMIT]), cells[0], cells[4]
     kinds, places, sizes, _, is_soft = walls
@@ -240,19 +244,20 @@ def step_colonies(taken, which, begin, dt, longest, cells, drags, alphas, walls,
             continue
         if opened(first, end, longest, cells, drags, out, report):
             steps = int(report[SUBSTEPS])
-            of = spatial_order(x[first:end], 6.0 * radius[first]) + first
+            give_back(memory, 0)
+            of = spatial_order(memory, x[first:end], 6.0 * radius[first]) + first
             own_x, own_axis, start, roots, length, share, own_radius, viscosity, drag = taken_out(
-                of, steps, dt / steps, cells, drags, walls, dof
+                memory, of, steps, dt / steps, cells, drags, walls, dof
             )
-            own_alpha, last = alphas_of(of, dt / steps, alphas), start.copy()
+            own_alpha, last = alphas_of(memory, of, dt / steps, alphas), start.copy()
             if own_alpha.shape[0] == 0:
                 own_alpha = (PENALTY / drag).astype(own_alpha.dtype)
             overlap, tolerance = _asked(settings, own_alpha * drag, own_radius, steps > 1)
             passes = int(settings[COARSE_PASSES] if steps > 1 else settings[MOST_PASSES])
             for _ in range(steps):
                 length = step_colony(
-                    own_x, own_axis, length, share, own_radius, viscosity, drag, own_alpha, start,
-                    last, overlap, kinds, places[:, b], sizes[:, b], roots, is_soft, passes,
+                    memory, own_x, own_axis, length, share, own_radius, viscosity, drag, own_alpha,
+                    start, last, overlap, kinds, places[:, b], sizes[:, b], roots, is_soft, passes,
                     tolerance, limit, soft, report, dof,
                 )  # fmt: skip
             put_back(of, own_x, own_axis, last, length, out[0], out[1], out[3], out[2], dof)

@@ -175,7 +175,7 @@ def _rounding_residual(H, one, two, gaps, alpha, y, inverse, z, dof):
 
 
 @kernel
-def minimise(H, one, two, rows, gaps, pushed, alpha, low, rigid, y, tolerance, limit, dof):
+def minimise(memory, H, one, two, rows, gaps, pushed, alpha, low, rigid, y, tolerance, limit, dof):
     """Minimise E from y, in place, until the worst entry of the preconditioned residual is at most
     `tolerance` of that at rest.
 
@@ -186,8 +186,8 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, rigid, y, tolerance, l
     gaps, act, on = gaps[:rows], np.ones(rows, np.uint8), np.arange(rows).astype(np.int32)
     g, z, d, p = np.empty_like(y), np.empty_like(y), np.zeros_like(y), np.empty_like(y)
     inverse, floor = np.empty((n, len(dof), len(dof)), y.dtype), _floor(y)
-    begin, halves = rows_of_cells(one, two, rows, n)
-    one, two = one[:rows], second_cells(H, one, two, rows)
+    begin, halves = rows_of_cells(memory, one, two, rows, n)
+    one, two = one[:rows], second_cells(memory, H, one, two, rows)
     held = np.zeros(n, np.uint8)
     for i in range(n):
         put_inverse(inverse, i, H, halves, act, begin[i], begin[i + 1], alpha[i], floor, False, dof)

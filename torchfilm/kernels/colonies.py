@@ -24,6 +24,7 @@ import numpy as np
 
 from torchfilm.kernels.batch import cells_of
 from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.memory import room
 from torchfilm.kernels.scheme import (
     BAD_DRAG,
     BURIED,
@@ -104,18 +105,19 @@ def opened(first, end, longest, cells, drags, out, report):
 
 
 @kernel
-def taken_out(of, steps, dt, cells, drags, walls, dof):
+def taken_out(memory, of, steps, dt, cells, drags, walls, dof):
     """The cells `of`, in this order and in float64, for sub-steps of dt hours: position, axis, last
     move, weights or stiffness · dt of walls (S, n), length before growth, growth in a sub-step,
     radius, viscosity and length drag."""
     x, axis, length, growth, radius, last, _, _, _ = cells
     n, is_soft = of.shape[0], walls[4]
-    own_x, own_axis, own_last, own_roots = cells_of(of, x, axis, last, walls[3], dof)
+    own_x, own_axis, own_last, own_roots = cells_of(memory, of, x, axis, last, walls[3], dof)
     for w in range(is_soft.shape[0]):
         for i in range(n if is_soft[w] else 0):
             own_roots[w, i] *= dt
-    base, share, own_radius = np.empty(n), np.empty(n), np.empty(n)
-    viscosity, length_drag = np.empty(n), np.empty(n)
+    base, share = room(memory, (n,), np.float64), room(memory, (n,), np.float64)
+    own_radius = room(memory, (n,), np.float64)
+    viscosity, length_drag = room(memory, (n,), np.float64), room(memory, (n,), np.float64)
     for i in range(n):
         base[i], share[i] = length[of[i]] - growth[of[i]], growth[of[i]] / steps
         own_radius[i], viscosity[i] = radius[of[i]], viscosity_of(drags, of[i])
@@ -124,10 +126,10 @@ def taken_out(of, steps, dt, cells, drags, walls, dof):
 
 
 @kernel
-def alphas_of(of, dt, alphas):
+def alphas_of(memory, of, dt, alphas):
     """α of the cells `of` in sub-steps of dt hours, (n,); (0,) where none is given."""
     kind, given = alphas
-    own = np.empty(0 if kind == NOT_GIVEN else of.shape[0], given.dtype)
+    own = room(memory, (0 if kind == NOT_GIVEN else of.shape[0],), given.dtype)
     for i in range(own.shape[0]):
         value = value_of(given, of[i])
         own[i] = 1.0 / (value * dt) if kind == OF_STIFFNESS else value
@@ -135,9 +137,9 @@ def alphas_of(of, dt, alphas):
 
 
 @kernel
-def shortest_of(of, base, radius, cells):
+def shortest_of(memory, of, base, radius, cells):
     """The length, µm, below which pressure takes none of the cells `of`, (n,)."""
-    compression, own = cells[8], np.empty_like(base)
+    compression, own = cells[8], room(memory, base.shape, np.float64)
     for i in range(of.shape[0]):
         left = COMPRESSION * (base[i] + 2 * radius[i]) - compression[of[i]]
         own[i] = max(base[i] - max(left, 0.0), 0.0)

@@ -21,6 +21,7 @@ from torchfilm.kernels.capsules import (
     squared_sine,
 )
 from torchfilm.kernels.compiling import index, kernel
+from torchfilm.kernels.memory import room
 from torchfilm.kernels.rows import FAR, HARD, degrees, half_of
 from torchfilm.kernels.scheme import BEYOND
 from torchfilm.kernels.vectors import WIDTH, any_of, load, store, where
@@ -95,10 +96,11 @@ def _measure(rows, vectors, margin, dof):
 
 
 @kernel
-def near_contacts(x, axis, half, radius, first, second, margin, dof):
+def near_contacts(memory, x, axis, half, radius, first, second, margin, dof):
     """The pairs nearer than margin: their number, closest points and gap, µm."""
     m = first.shape[0]
-    keep, points, gap = np.empty(m, np.int32), np.empty((m, 2)), np.empty(m)
+    keep, points = room(memory, (m,), np.int32), room(memory, (m, 2), np.float64)
+    gap = room(memory, (m,), np.float64)
     block, found = np.zeros((FIRST_ROW, PAIRS)), index(0)
     for start in range(0, m, PAIRS):
         count = min(PAIRS, m - start)

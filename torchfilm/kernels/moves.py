@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.memory import room
 from torchfilm.kernels.rows import degrees
 from torchfilm.kernels.scheme import MAX_TURN
 
@@ -83,7 +84,7 @@ def move_cells(x, axis, length, y, scale, about, bound, least, dof):
 
 
 @kernel
-def approach(x, length, radius, y, dof):
+def approach(memory, x, length, radius, y, dof):
     """How much nearer, at most, cells can have come by the move y of `move_cells`, µm: any two that
     are near, and what each adds to that, (n,).
 
@@ -103,7 +104,7 @@ def approach(x, length, radius, y, dof):
             away = x[i, k] - centre[k]
             along += away * (y[i, k] - mean[k])
             square += away * away
-    stretch, own, most = along / square, np.empty(n), 0.0
+    stretch, own, most = along / square, room(memory, (n,), np.float64), 0.0
     for i in range(n):
         rest, turn = 0.0, 0.0
         for k in range(d):

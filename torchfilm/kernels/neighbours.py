@@ -8,6 +8,7 @@ import numpy as np
 
 from torchfilm.kernels.compiling import index, kernel
 from torchfilm.kernels.lanes import boxes_meet, copy_row
+from torchfilm.kernels.memory import room, zeros
 
 # By how much boxes are enlarged, of their distance from the colony's corner: as single numbers they
 # are rounded by less.
@@ -18,12 +19,12 @@ FEW = 64
 
 
 @kernel
-def _boxes(x, axis, half, radius, margin, box, low, high, dof):
+def _boxes(memory, x, axis, half, radius, margin, box, low, high, dof):
     """Each cell's box (n, len(dof)), from the colony's corner, with half of margin around it, as
     `boxes_meet` takes it, and the first and last bin of it along each axis; returns the number of
     bins."""
     n, d, other = x.shape[0], 2 if len(dof) == 4 else 3, len(dof) // 2
-    size, ends = 0.0, np.empty((n, d))
+    size, ends = 0.0, room(memory, (n, d), np.float64)
     least = np.full(d, np.inf)
     for i in range(n):
         for k in range(d):
@@ -42,10 +43,10 @@ def _boxes(x, axis, half, radius, margin, box, low, high, dof):
 
 
 @kernel
-def _slots_of(low, high, top, slots, some):
+def _slots_of(memory, low, high, top, slots, some):
     """Which slots have to be filled, (slots,): those of the cells marked in `some`, (n,)."""
     n, d = low.shape
-    used = np.zeros(slots, np.uint8)
+    used = zeros(memory, (slots,), np.uint8)
     for i in range(n):
         if some[i]:
             z0, z1 = (low[i, 2], high[i, 2]) if d == 3 else (np.int64(0), np.int64(0))
@@ -58,21 +59,24 @@ def _slots_of(low, high, top, slots, some):
 
 
 @kernel
-def _fill_table(low, high, top, used, boxes, dof):
+def _fill_table(memory, low, high, top, used, boxes, dof):
     """Members sorted by slot, of the slots that are used, and where each slot begins. Each has 8
     times the number of its bin, and a bit for each axis along which this is the first bin of its
     box; and its box."""
     slots = used.shape[0]
     n, d = low.shape
     rows, layers = top[0], top[0] * top[1]
-    begin = np.zeros(slots + 1, np.int64)
+    begin = zeros(memory, (slots + 1,), np.int64)
     for turn in range(2):
         if turn == 1:
             for s in range(slots):
                 begin[s + 1] += begin[s]
-            member, key = np.empty(begin[slots], np.int32), np.empty(begin[slots], np.int64)
-            box = np.empty((begin[slots], len(dof)), np.float32)
-            fill = begin[:-1].copy()
+            members = begin[slots]
+            member, key = room(memory, (members,), np.int32), room(memory, (members,), np.int64)
+            box = room(memory, (members, len(dof)), np.float32)
+            fill = room(memory, (slots,), np.int64)
+            for s in range(slots):
+                fill[s] = begin[s]
         for i in range(n):
             z0, z1 = (low[i, 2], high[i, 2]) if d == 3 else (np.int64(0), np.int64(0))
             for bz in range(z0, z1 + 1):
@@ -94,44 +98,47 @@ def _fill_table(low, high, top, used, boxes, dof):
 
 
 @kernel
-def near_pairs(x, axis, half, radius, margin, dof):
+def near_pairs(memory, x, axis, half, radius, margin, dof):
     """Pairs (i < j) whose boxes come nearer than margin, and a few more, each once, sorted by i.
 
     Cells of any size: a long cell lies in many bins. A pair is found in the first bin that both
     cover: along each axis it is the first of one of them.
     """
-    return near_pairs_of(x, axis, half, radius, margin, np.empty(0, np.uint8), dof)
+    return near_pairs_of(memory, x, axis, half, radius, margin, np.empty(0, np.uint8), dof)
 
 
 @kernel
-def near_pairs_of(x, axis, half, radius, margin, some, dof):
+def near_pairs_of(memory, x, axis, half, radius, margin, some, dof):
     """Those of `near_pairs` of which a cell is marked in `some`, (n,) uint8; (0,) for all."""
     n, d = x.shape[0], 2 if len(dof) == 4 else 3
-    low, high = np.empty((n, d), np.int64), np.empty((n, d), np.int64)
-    boxes = np.zeros((n, len(dof)), np.float32)
-    top = _boxes(x, axis, half, radius, margin, boxes, low, high, dof)
+    low, high = room(memory, (n, d), np.int64), room(memory, (n, d), np.int64)
+    boxes = zeros(memory, (n, len(dof)), np.float32)
+    top = _boxes(memory, x, axis, half, radius, margin, boxes, low, high, dof)
     if n <= FEW:
-        first, second = _among_few(boxes, dof)
+        first, second = _among_few(memory, boxes, dof)
         return _with_some(first, second, some)
     slots = 16
     while slots < 2 * n:
         slots *= 2
-    used = np.ones(slots, np.uint8)
     if some.shape[0]:
-        used = _slots_of(low, high, top, slots, some)
-    begin, member, key, box = _fill_table(low, high, top, used, boxes, dof)
+        used = _slots_of(memory, low, high, top, slots, some)
+    else:
+        used = room(memory, (slots,), np.uint8)
+        for s in range(slots):
+            used[s] = 1
+    begin, member, key, box = _fill_table(memory, low, high, top, used, boxes, dof)
     most = 0
     for s in range(slots):
         most = max(most, begin[s + 1] - begin[s])
-    room = most + min(8 * n, 8 * member.shape[0])
-    first, second = np.empty(room, np.int32), np.empty(room, np.int32)
+    size = most + min(8 * n, 8 * member.shape[0])
+    first, second = room(memory, (size,), np.int32), room(memory, (size,), np.int32)
     table, slot, place, found = (begin, member, key, box), 0, 0, 0
     while place < member.shape[0]:
         if found + most > first.shape[0]:
-            first, second = _longer(first), _longer(second)
+            first, second = _longer(memory, first), _longer(memory, second)
         slot, place, found = _search(table, slot, place, found, most, first, second, dof)
     first, second = _with_some(first[:found], second[:found], some)
-    return _by_first(first, second, n)
+    return _by_first(memory, first, second, n)
 
 
 @kernel
@@ -147,10 +154,10 @@ def _with_some(first, second, some):
 
 
 @kernel
-def _among_few(boxes, dof):
+def _among_few(memory, boxes, dof):
     """The pairs of boxes that meet, each compared with each."""
     n, found = boxes.shape[0], index(0)
-    first, second = np.empty(n * n, np.int32), np.empty(n * n, np.int32)
+    first, second = room(memory, (n * n,), np.int32), room(memory, (n * n,), np.int32)
     for i in range(n):
         for j in range(i + 1, n):
             first[found], second[found] = i, j
@@ -165,11 +172,11 @@ def _search(table, slot, place, found, most, first, second, dof):
     many pairs there are."""
     begin, member, key, box = table
     found, one, p = index(found), index(1), index(place)
-    room = index(first.shape[0] - most)
+    full = index(first.shape[0] - most)
     for s in range(slot, begin.shape[0] - 1):
         end = index(begin[s + 1])
         while p < end:
-            if found > room:
+            if found > full:
                 return s, np.int64(p), np.int64(found)
             i, own = member[p], key[p]
             for q in range(p + one, end):  # without branches: their outcome is not foreseen
@@ -181,23 +188,23 @@ def _search(table, slot, place, found, most, first, second, dof):
 
 
 @kernel
-def _longer(a):
-    out = np.empty(2 * a.shape[0], a.dtype)
+def _longer(memory, a):
+    out = room(memory, (2 * a.shape[0],), a.dtype)
     for i in range(a.shape[0]):  # an assigned slice takes Numba seconds
         out[i] = a[i]
     return out
 
 
 @kernel
-def _by_first(first, second, n):
+def _by_first(memory, first, second, n):
     """The pairs sorted by their first cell, otherwise in order."""
     m = first.shape[0]
-    place = np.zeros(n + 1, np.int64)
+    place = zeros(memory, (n + 1,), np.int64)
     for k in range(m):
         place[index(first[k]) + index(1)] += 1
     for i in range(n):
         place[i + 1] += place[i]
-    one, other = np.empty(m, np.int32), np.empty(m, np.int32)
+    one, other = room(memory, (m,), np.int32), room(memory, (m,), np.int32)
     for k in range(m):
         i = index(first[k])
         p = index(place[i])
@@ -207,7 +214,7 @@ def _by_first(first, second, n):
 
 
 @kernel
-def spatial_order(x, width):
+def spatial_order(memory, x, width):
     """An order of cells in which neighbours in space are near each other: strips along x, of this
     width, and bins a quarter as long, with those of a bin in the order given. A colony that is
     spread thinly has larger ones."""
@@ -220,13 +227,14 @@ def spatial_order(x, width):
     strips = int((high1 - low1) / width) + 1
     long = max(0.25 * width, (high0 - low0) * strips / (8.0 * n))
     bins = int((high0 - low0) / long) + 1
-    own, begin = np.empty(n, np.int64), np.zeros(strips * bins + 1, np.int64)
+    own = room(memory, (n,), np.int64)
+    begin = zeros(memory, (strips * bins + 1,), np.int64)
     for i in range(n):
         own[i] = int((x[i, 1] - low1) / width) * bins + int((x[i, 0] - low0) / long)
         begin[own[i] + 1] += 1
     for b in range(strips * bins):
         begin[b + 1] += begin[b]
-    order = np.empty(n, np.int64)
+    order = room(memory, (n,), np.int64)
     for i in range(n):
         order[begin[own[i]]] = i
         begin[own[i]] += 1

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from torchfilm.kernels.compiling import index, kernel
+from torchfilm.kernels.memory import room, zeros
 
 FLAT, INSIDE, OUTSIDE = 0, 1, 2
 # Rows: of rigid contacts, of walls with a stiffness and with a weight below 1, and of two cells at
@@ -26,10 +27,10 @@ def degrees(dof):
 
 
 @kernel
-def deeply_overlapping(found, radius):
+def deeply_overlapping(memory, found, radius):
     """How many cells lie deeper in another than a radius."""
     first, second, keep, _, gap = found
-    deeply = np.zeros(radius.shape[0], np.int64)
+    deeply = zeros(memory, (radius.shape[0],), np.int64)
     for k in range(keep.shape[0]):
         i, j = first[keep[k]], second[keep[k]]
         if gap[k] < -0.5 * (radius[i] + radius[j]):
@@ -152,17 +153,18 @@ def rows_among(H, gaps, one, two, soft, rows, number):
 
 
 @kernel
-def rows_of_cells(one, two, rows, n):
+def rows_of_cells(memory, one, two, rows, n):
     """The halves of each cell, in the order of rows: where each cell's begin, and the halves."""
-    begin = np.zeros(n + 1, np.int64)
+    begin = zeros(memory, (n + 1,), np.int64)
     for r in range(rows):
         begin[index(one[r]) + index(1)] += 1
         if two[r] >= 0:
             begin[index(two[r]) + index(1)] += 1
     for i in range(n):
         begin[i + 1] += begin[i]
-    half = np.empty(begin[n], np.int32)
-    fill = begin[:-1].copy()
+    half, fill = room(memory, (begin[n],), np.int32), room(memory, (n,), np.int64)
+    for i in range(n):
+        fill[i] = begin[i]
     for r in range(rows):
         i = index(one[r])
         half[index(fill[i])] = 2 * r

@@ -16,6 +16,7 @@ import math
 import numpy as np
 
 from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.memory import room, zeros
 from torchfilm.kernels.rows import degrees, rows_of_cells
 from torchfilm.kernels.scheme import CREEP, FORCING, LEVEL, MOST_LOOKS, MOST_ROUNDS
 from torchfilm.kernels.solve_parts import (
@@ -29,6 +30,7 @@ from torchfilm.kernels.solve_parts import (
     keep_pushing,
     next_direction,
     of_drag,
+    overlaps,
     precondition,
     put_forces,
     put_scaled,
@@ -231,21 +233,34 @@ def _advance(one, two, e, q, v, pushed, act, stale, low, y, d, lengths, share, t
 
 
 @kernel(inline=True)
-def _work(H, one, two, rows, gaps, pushed, alpha, low, y, pieces, dof):
+def _work(memory, H, one, two, rows, gaps, pushed, alpha, low, y, pieces, dof):
     """The arrays of a solve: see `solve_pieces.put_on_board`."""
     n, kind = y.shape[0], y.dtype
-    begin, halves = rows_of_cells(one, two, rows, n)
-    two = second_cells(H, one, two, rows)
-    mine_begin, mine = rows_of_pieces(one, two, rows, n, pieces if pieces > 1 else 0)
+    begin, halves = rows_of_cells(memory, one, two, rows, n)
+    two = second_cells(memory, H, one, two, rows)
+    mine_begin, mine = rows_of_pieces(memory, one, two, rows, n, pieces if pieces > 1 else 0)
+    stale = room(memory, (n,), np.uint8)
+    for i in range(n):
+        stale[i] = 1
+    of_rows, of_cells, moves = (rows,), (n,), (n, len(dof))
     return (
-        H, one, two, gaps[:rows].copy(), np.empty(rows, kind), np.empty(rows, kind), pushed,
-        np.zeros(rows, np.uint8), np.ones(n, np.uint8), alpha, low, y, np.empty_like(y),
-        np.empty_like(y), np.empty_like(y), np.empty_like(y),
-        np.empty((n, len(dof), len(dof)), kind), np.empty(n, kind), np.empty(n, kind), begin,
-        halves, np.zeros((3, n), np.uint8), mine_begin, mine,
-        np.empty(max(rows, mine.shape[0]), np.int32),
-        np.zeros(pieces, np.int64), np.empty((3, (n + BLOCK - 1) // BLOCK)), np.empty(1, kind),
+        H, one, two, _copied(memory, gaps, rows), room(memory, of_rows, kind),
+        room(memory, of_rows, kind), pushed, zeros(memory, of_rows, np.uint8), stale, alpha, low, y,
+        room(memory, moves, kind), room(memory, moves, kind), room(memory, moves, kind),
+        room(memory, moves, kind), room(memory, (n, len(dof), len(dof)), kind),
+        room(memory, of_cells, kind), room(memory, of_cells, kind), begin, halves,
+        zeros(memory, (3, n), np.uint8), mine_begin, mine,
+        room(memory, (max(rows, mine.shape[0]),), np.int32), zeros(memory, (pieces,), np.int64),
+        room(memory, (3, (n + BLOCK - 1) // BLOCK), np.float64), room(memory, (1,), kind),
     )  # fmt: skip
+
+
+@kernel
+def _copied(memory, gaps, rows):
+    out = room(memory, (rows,), gaps.dtype)
+    for r in range(rows):
+        out[r] = gaps[r]
+    return out
 
 
 @kernel
@@ -260,7 +275,9 @@ def _error(fall, left, overlap, cap):
 
 
 @kernel
-def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, limit, team, dof):
+def minimise(
+    memory, H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, limit, team, dof
+):
     """Minimise E from y, in place.
 
     pushed: what soft rows have already exerted in this step, (rows,); or (0,) for nothing. low:
@@ -271,12 +288,12 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, lim
     error, and each row's gap after the move.
     """
     n, D = y.shape[0], degrees(dof)
-    if not np.any(gaps[:rows] < 0):  # nothing pushes: such a colony does not move at all
+    if not overlaps(gaps, rows):  # nothing pushes: such a colony does not move at all
         y[:] = 0
-        return 0, 0.0, gaps[:rows].copy()
+        return 0, 0.0, _copied(memory, gaps, rows)
     pieces = pieces_for(team, n)
     team = team[: 0 if pieces == 1 else team.shape[0]]
-    work = _work(H, one, two, rows, gaps, pushed, alpha, low, y, pieces, dof)
+    work = _work(memory, H, one, two, rows, gaps, pushed, alpha, low, y, pieces, dof)
     if pieces > 1:
         put_on_board(team, work, n, rows)
     (_, one, two, e, q, v, _, act, stale, _, _, _, g, z, d, p, inverse, slope, own, begin, halves,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from torchfilm.kernels.compiling import index, kernel
 from torchfilm.kernels.lanes import add_scaled, dot, dot_row, put_inverse, put_product
+from torchfilm.kernels.memory import room
 from torchfilm.kernels.rows import degrees
 from torchfilm.kernels.scheme import RAISED, ROUNDING
 
@@ -231,12 +232,22 @@ def keep_pushing(act, rows, on):
 
 
 @kernel
-def second_cells(H, one, two, rows):
+def second_cells(memory, H, one, two, rows):
     """The second cell of each row; the first where there is no second, whose half of the row is
     made 0. So all rows are alike."""
-    other = two[:rows].copy()
+    other = room(memory, (rows,), two.dtype)
     for r in range(rows):
+        other[r] = two[r]
         if two[r] < 0:
             other[r] = one[r]
             H[2 * r + 1] = 0.0
     return other
+
+
+@kernel
+def overlaps(gaps, rows):
+    """Whether one of the rows is of an overlap."""
+    some = False
+    for r in range(rows):
+        some |= gaps[r] < 0
+    return some

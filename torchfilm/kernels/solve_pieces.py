@@ -6,6 +6,7 @@ import numpy as np
 
 from torchfilm.kernels import solve_parts as parts
 from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.memory import room, zeros
 from torchfilm.kernels.team import BLOCK, LOOP, NUMBERS, PIECES, array_at, range_of
 
 # The loops: gaps after the first move, what the rows' forces ask of the cells, a product of CG, a
@@ -21,23 +22,23 @@ N, ROWS, CREEPS, FREE = range(NUMBERS, NUMBERS + 4)
 
 
 @kernel
-def rows_of_pieces(one, two, rows, n, pieces):
+def rows_of_pieces(memory, one, two, rows, n, pieces):
     """The rows of the cells of each piece, in their order: where each piece's begin, and the rows.
     A row of two pieces stands in both. No rows where there are no pieces."""
     if pieces == 0:
-        return np.empty(0, np.int64), np.empty(0, np.int32)
-    owner = np.empty((n + BLOCK - 1) // BLOCK, np.int64)
+        return room(memory, (0,), np.int64), room(memory, (0,), np.int32)
+    owner = room(memory, ((n + BLOCK - 1) // BLOCK,), np.int64)
     for k in range(pieces):
         first, end = range_of(k, pieces, n)
         owner[first // BLOCK : (end + BLOCK - 1) // BLOCK] = k
-    begin = np.zeros(pieces + 1, np.int64)
+    begin = zeros(memory, (pieces + 1,), np.int64)
     for r in range(rows):
         a, b = owner[one[r] // BLOCK], owner[two[r] // BLOCK]
         begin[a + 1] += 1
         begin[b + 1] += a != b
     for k in range(pieces):
         begin[k + 1] += begin[k]
-    fill, mine = begin[:-1].copy(), np.empty(begin[pieces], np.int32)
+    fill, mine = begin[:-1].copy(), room(memory, (begin[pieces],), np.int32)
     for r in range(rows):
         a, b = owner[one[r] // BLOCK], owner[two[r] // BLOCK]
         mine[fill[a]] = r

@@ -22,6 +22,7 @@ from numba import types
 
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.lanes import intrinsic, long_of
+from torchfilm.kernels.memory import pointer
 
 INT64 = ir.IntType(64)
 
@@ -121,27 +122,16 @@ def next_of(which, taken):
             return which[k]
 
 
-@intrinsic
-def _pointer(typing, address, like):
-    """A pointer to numbers of the type `like`, or of that of the numbers in it."""
-    kind = types.CPointer(like.dtype)
-
-    def emit(context, builder, signature, given):
-        return builder.inttoptr(given[0], context.get_value_type(kind))
-
-    return kind(types.int64, like), emit
-
-
 @kernel(inline=True)
 def array_at(board, k, like, shape):
     """The array of this shape whose address stands at board[k]; of the type of `like`."""
-    return numba.carray(_pointer(board[k], like), shape)
+    return numba.carray(pointer(board[k], like), shape)
 
 
 @kernel
 def board_at(address):
     """The board at this address."""
-    return numba.carray(_pointer(address, np.int64), (WORDS,))
+    return numba.carray(pointer(address, np.int64), (WORDS,))
 
 
 def new_board(threads: int, least: int, taker: int) -> np.ndarray:

@@ -122,17 +122,19 @@ def _kernel_of(settings: OneSidedSettings | ContactSettings):
 
 def _call(kernel, which: np.ndarray, counts: np.ndarray, arguments: tuple) -> None:
     """Call the kernel for the colonies `which`, shared among threads, of which this is one."""
+    from torchfilm.kernels.memory import kept
+
     threads, taken = min(available(), which.size), np.zeros(1, np.int64)
     if threads < 2 or counts[which].sum() < WORTH_THREADS:
-        kernel(taken, which, *arguments)
+        kept.call(kernel, taken, which, *arguments)
         return
     # the largest first; a thread that wakes late finds less to do, or nothing
     which = which[np.argsort(-counts[which], kind="stable")]
     calls: list[Future] = []
     try:
         for _ in range(threads - 1):
-            calls.append(submit(kernel, taken, which, *arguments))
-        kernel(taken, which, *arguments)
+            calls.append(submit(kept.call, kernel, taken, which, *arguments))
+        kept.call(kernel, taken, which, *arguments)
     finally:
         taken[0] = which.size  # after an error, too: nobody takes another one
         _wait(calls)
@@ -162,6 +164,7 @@ def _call_by_team(
 ) -> None:
     """Call the kernel for one colony, by a team of threads that this one leads. It waits for no
     thread to begin: one that comes late finds nothing to do."""
+    from torchfilm.kernels.memory import kept
     from torchfilm.kernels.pieces import taker
     from torchfilm.kernels.team import OFFER, OVER, new_board
 
@@ -175,7 +178,8 @@ def _call_by_team(
     try:
         for _ in range(threads - 1):
             calls.append(submit(assist))
-        kernel(board, np.zeros(1, np.int64), np.array([colony]), *arguments)
+        by_team = partial(kernel, board)
+        kept.call(by_team, np.zeros(1, np.int64), np.array([colony]), *arguments)
     finally:
         board[OFFER] = OVER
         _wait(calls)
