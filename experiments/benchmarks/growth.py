@@ -141,7 +141,9 @@ def product_over_copy(cells: int = 10000) -> dict[str, float]:
     H, gaps = np.empty((2 * room, 4), np.float32), np.empty(room, np.float32)
     one, two = np.empty(room, np.int32), np.empty(room, np.int32)
     places = H, gaps, one, two, np.empty(room, np.uint8)
-    count = for_python(contacts.pair_rows)(x, axis, half, radius, scale, found, 0, places, 0.3, dof)
+    count = for_python(contacts.pair_rows)(
+        no_memory(), x, axis, half, radius, scale, found, 0, places, 0.3, dof
+    )
     p, out = np.ones((n, 4), np.float32), np.zeros((n, 4), np.float32)
     on = np.arange(count, dtype=np.int32)
     H = H[: 2 * count].copy()

@@ -11,7 +11,17 @@ import torch
 import torchfilm as tf
 from torchfilm.kernels import memory
 from torchfilm.kernels.compiling import kernel
-from torchfilm.kernels.memory import LINE, MOST, TOP, KeptMemory, give_back, room, zeros
+from torchfilm.kernels.memory import (
+    LAST,
+    LINE,
+    MARKS,
+    MOST,
+    TOP,
+    KeptMemory,
+    give_back,
+    room,
+    zeros,
+)
 
 
 @kernel(entry=True)
@@ -31,7 +41,7 @@ def addresses(kept, out):
 
 
 def test_arrays_lie_one_after_the_other_and_what_is_given_back_is_used_again():
-    store, marks, out = memory.new_store(1000), np.zeros(2, np.int64), np.zeros(6, np.int64)
+    store, marks, out = memory.new_store(1000), np.zeros(MARKS, np.int64), np.zeros(6, np.int64)
     store[:] = 255
     addresses((store, marks), out)
     first = store.ctypes.data
@@ -40,13 +50,14 @@ def test_arrays_lie_one_after_the_other_and_what_is_given_back_is_used_again():
     assert (a, b, c, d) == (0, 128, 128, 128)
     assert tuple(out[4:]) == (0, 15)
     assert (store[:120].view(np.float64) == 1.0).all() and (store[120:128] == 255).all()
-    assert marks[TOP] == 192 and marks[MOST] == 192
+    assert marks.tolist() == [192, 192, 0]
 
 
 def test_what_finds_no_room_is_allocated_and_the_store_is_then_made_large_enough():
     kept, out = KeptMemory(), np.zeros(6, np.int64)
     kept.call(addresses, out)
-    assert tuple(out[4:]) == (0, 15) and kept.store.size >= 192 and kept.marks[MOST] == 0
+    assert tuple(out[4:]) == (0, 15) and kept.store.size >= 192
+    assert (out[:4] % LINE == 0).all() and kept.marks[MOST] == kept.marks[LAST] == 0
     kept.marks[TOP] = 0
     kept.call(addresses, out)
     assert (out[:4] >= kept.store.ctypes.data).all()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.compiling import lean
 from torchfilm.kernels.memory import room, zeros
 from torchfilm.kernels.rows import degrees
 
 
-@kernel
+@lean
 def cells_of(memory, of, x, axis, last, roots, dof):
     """x and axis (n, d) in float64, last (n, len(dof)) and roots (S, n) of the cells `of`."""
     D = degrees(dof)
@@ -27,7 +27,7 @@ def cells_of(memory, of, x, axis, last, roots, dof):
     return own_x, own_axis, own_last, own_roots
 
 
-@kernel
+@lean
 def put_back(of, own_x, own_axis, own_last, own_length, x, axis, last, length, dof):
     """Write what the cells `of` have become into the batch."""
     D = degrees(dof)
@@ -40,7 +40,7 @@ def put_back(of, own_x, own_axis, own_last, own_length, x, axis, last, length, d
         length[of[i]] = own_length[i]
 
 
-@kernel
+@lean
 def put(rows, out):
     """Writes rows (n, D) into out. `out[:] = rows` would take Numba seconds to compile."""
     for i in range(rows.shape[0]):

@@ -207,7 +207,7 @@ def step_colony(memory, x, axis, base, growth, radius, viscosity, length_drag, a
             for i in range(n):
                 for k in range(degrees(dof)):
                     y[i, k] = start[i, k] / scale[i, k]
-        m = pair_rows(x, axis, half, radius, scale, found, walls, rows, 0.0, dof)
+        m = pair_rows(memory, x, axis, half, radius, scale, found, walls, rows, 0.0, dof)
         m = _holding_rows(rows, walls, m, radius, hold, soft)
         low = ((base - length) / scale[:, end]).astype(last.dtype)
         y, iterations, error, status = _solved(

@@ -23,7 +23,7 @@ import math
 import numpy as np
 
 from torchfilm.kernels.batch import cells_of
-from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.compiling import kernel, lean
 from torchfilm.kernels.memory import room
 from torchfilm.kernels.scheme import (
     BAD_DRAG,
@@ -46,19 +46,19 @@ REPORT = 7
 NOT_GIVEN, GIVEN, OF_STIFFNESS = range(3)
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def value_of(values, i):
     """The value of cell i, where there may be one for all cells."""
     return values[i if values.shape[0] > 1 else 0]
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def viscosity_of(drags, i):
     viscosity, _, factor = drags
     return value_of(viscosity, i) * factor[i] if factor.shape[0] else value_of(viscosity, i)
 
 
-@kernel
+@lean
 def _finite(columns, i):
     """Whether row i of an (n, D) array is finite."""
     good = True
@@ -67,7 +67,7 @@ def _finite(columns, i):
     return good
 
 
-@kernel
+@lean
 def substeps(first, end, longest, cells, drags):
     """Sub-steps and status of the colony of the cells first … end − 1: see
     `physics.substeps`."""
@@ -88,7 +88,7 @@ def substeps(first, end, longest, cells, drags):
     return max(int(wanted), 1), status
 
 
-@kernel
+@lean
 def opened(first, end, longest, cells, drags, out, report):
     """Puts the cells, as they were before growth, into `out`, and sub-steps and status into the
     report. Returns whether the colony can be stepped."""
@@ -104,7 +104,7 @@ def opened(first, end, longest, cells, drags, out, report):
     return report[STATUS] == CONVERGED
 
 
-@kernel
+@lean
 def taken_out(memory, of, steps, dt, cells, drags, walls, dof):
     """The cells `of`, in this order and in float64, for sub-steps of dt hours: position, axis, last
     move, weights or stiffness · dt of walls (S, n), length before growth, growth in a sub-step,
@@ -146,7 +146,7 @@ def shortest_of(memory, of, base, radius, cells):
     return own
 
 
-@kernel
+@lean
 def closed(first, end, cells, alpha, out, report):
     """What a step leaves to the next one: by how much cells have grown and been compressed, α, and
     for how many steps in a row contacts have not held the colony's cells apart."""

@@ -20,8 +20,8 @@ from torchfilm.kernels.capsules import (
     squared_distance,
     squared_sine,
 )
-from torchfilm.kernels.compiling import index, kernel
-from torchfilm.kernels.memory import room
+from torchfilm.kernels.compiling import index, lean
+from torchfilm.kernels.memory import room, zeros
 from torchfilm.kernels.rows import FAR, HARD, degrees, half_of
 from torchfilm.kernels.scheme import BEYOND
 from torchfilm.kernels.vectors import WIDTH, any_of, load, store, where
@@ -47,13 +47,13 @@ OF_ROW = 21
 COLUMNS = FIRST_ROW + ROWS * OF_ROW
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def most_rows(dof):
     """Of a pair."""
     return ROWS if len(dof) == 8 else 2
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _put_cells(block, k, i, j, x, axis, half, radius, dof):
     """Puts the cells i and j into column k."""
     for c in range(2 if len(dof) == 4 else 3):
@@ -63,22 +63,22 @@ def _put_cells(block, k, i, j, x, axis, half, radius, dof):
     block[RADIUS_A, k], block[RADIUS_B, k] = radius[i], radius[j]
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _vector(rows, column, g):
     return load(rows, column * VECTORS + g)
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _put(rows, column, g, x):
     store(rows, column * VECTORS + g, x)
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _three(rows, column, g):
     return _vector(rows, column, g), _vector(rows, column + 1, g), _vector(rows, column + 2, g)
 
 
-@kernel
+@lean
 def _measure(rows, vectors, margin, dof):
     """The closest points of pairs, their gap, and whether it is below the margin."""
     for g in range(vectors):
@@ -95,13 +95,13 @@ def _measure(rows, vectors, margin, dof):
         _put(rows, NEAR, g, where(near, 1.0, 0.0))
 
 
-@kernel
+@lean
 def near_contacts(memory, x, axis, half, radius, first, second, margin, dof):
     """The pairs nearer than margin: their number, closest points and gap, µm."""
     m = first.shape[0]
     keep, points = room(memory, (m,), np.int32), room(memory, (m, 2), np.float64)
     gap = room(memory, (m,), np.float64)
-    block, found = np.zeros((FIRST_ROW, PAIRS)), index(0)
+    block, found = zeros(memory, (FIRST_ROW, PAIRS), np.float64), index(0)
     for start in range(0, m, PAIRS):
         count = min(PAIRS, m - start)
         for k in range(count):
@@ -115,12 +115,12 @@ def near_contacts(memory, x, axis, half, radius, first, second, margin, dof):
     return keep[:found], points[:found], gap[:found]
 
 
-@kernel
-def deepest_of(x, axis, half, radius, found, dof):
+@lean
+def deepest_of(memory, x, axis, half, radius, found, dof):
     """The least gap of the contacts `found` where cells are now, µm, or 0. found: as in
     `pair_rows`."""
     first, second, keep = found[:3]
-    block, deepest = np.zeros((FIRST_ROW, PAIRS)), 0.0
+    block, deepest = zeros(memory, (FIRST_ROW, PAIRS), np.float64), 0.0
     for start in range(0, keep.shape[0], PAIRS):
         some = keep[start : start + PAIRS]
         for k in range(some.shape[0]):
@@ -132,7 +132,7 @@ def deepest_of(x, axis, half, radius, found, dof):
     return deepest
 
 
-@kernel
+@lean
 def _apart(ax, ay, az, cx, cy, cz, d):
     """A direction that separates two cells whose centrelines cross."""
     sign = -1.0 if ax * cx + ay * cy < 0 else 1.0
@@ -153,7 +153,7 @@ def _apart(ax, ay, az, cx, cy, cz, d):
     return nx, ny, nz
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _end_of_sphere(nx, ny, nz, ax, ay, az, half, end, dof):
     """A sphere grows at both ends at once: the end nearer to the contact counts."""
     along = dot_of(nx, ny, nz, ax, ay, az, dof)
@@ -161,7 +161,7 @@ def _end_of_sphere(nx, ny, nz, ax, ay, az, half, end, dof):
     return where(half <= 1e-9, sign, end)
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _put_row(rows, row, g, s, t, end_a, end_b, weight, dof):
     """A row of each pair, before it is scaled, at the points s and t of the centrelines. Returns
     whether centrelines cross."""
@@ -186,7 +186,7 @@ def _put_row(rows, row, g, s, t, end_a, end_b, weight, dof):
     return any_of(distance <= CROSSING * touching)
 
 
-@kernel
+@lean
 def _part(block, row, k, dof):
     """The row of column k again, if its centrelines cross: along a direction that parts them."""
     if block[row + DISTANCE, k] > CROSSING * (block[RADIUS_A, k] + block[RADIUS_B, k]):
@@ -207,7 +207,7 @@ def _part(block, row, k, dof):
         block[row + OWN + c, k], block[row + OTHER + c, k] = own[c], other[c]
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _put_far_row(rows, k, g, far, s, t, end_a, end_b, margin, dof):
     """A row of weight ½ at an end of the stretch, for pairs `far` that are near there, too."""
     row, has = FIRST_ROW + (2 + k) * OF_ROW, where(far, 1.0, 0.0)
@@ -221,7 +221,7 @@ def _put_far_row(rows, k, g, far, s, t, end_a, end_b, margin, dof):
         _put(rows, HAS + 2 + k, g, 0.0 * has)
 
 
-@kernel
+@lean
 def _put_rows(rows, vectors, margin, dof):
     """The rows of pairs, before they are scaled: one at the closest points, or where the contact is
     a line two of weight ½, towards its ends; and in space, where the stretch along which cells lie
@@ -283,7 +283,7 @@ def _put_rows(rows, vectors, margin, dof):
     return crossing
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _side_by_side(ha, hb, offset):
     """Where two parallel segments lie side by side: from max(−ha, offset − hb) to min(ha, offset +
     hb)."""
@@ -291,15 +291,15 @@ def _side_by_side(ha, hb, offset):
     return where(low > -ha, low, -ha), where(high < ha, high, ha)
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _mark(side, beyond, width):
     """How far the end of a line of contact counts as an end of a cell."""
     mark = 1.0 + side * beyond * width
     return side * where(mark < 0.0, 0.0, mark)
 
 
-@kernel
-def pair_rows(x, axis, half, radius, scale, found, walls, rows, margin, dof):
+@lean
+def pair_rows(memory, x, axis, half, radius, scale, found, walls, rows, margin, dof):
     """Rows of the contacts `found`, after `walls` others; a line of contact has two rows of weight
     ½, and in space a pair has more where a turn would bring it together: where it is nearer than
     margin. Returns how many there are in all.
@@ -309,7 +309,8 @@ def pair_rows(x, axis, half, radius, scale, found, walls, rows, margin, dof):
     """
     first, second, keep, points, _ = found
     H, gaps, one, two, kind = rows
-    block, r, most = np.empty((COLUMNS, PAIRS)), index(walls), most_rows(dof)
+    block, r = room(memory, (COLUMNS, PAIRS), np.float64), index(walls)
+    most = most_rows(dof)
     for column in range(FIRST_ROW):  # the others are written before they are read
         for k in range(PAIRS):
             block[column, k] = 0.0
@@ -338,7 +339,7 @@ def pair_rows(x, axis, half, radius, scale, found, walls, rows, margin, dof):
     return np.int64(r)
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _put_scaled(H, h, block, half, k, scale, i, dof):
     for c in range(degrees(dof)):
         H[h, c] = block[half + c, k] * scale[i, c]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.compiling import lean
 from torchfilm.kernels.contacts import deepest_of, near_contacts
 from torchfilm.kernels.memory import room, zeros
 from torchfilm.kernels.moves import approach
@@ -20,7 +20,7 @@ from torchfilm.kernels.scheme import HOPS
 MOST_SOME = 0.3
 
 
-@kernel
+@lean
 def deep_cells(memory, found, rows, walls, deep, n):
     """Numbers of those of n cells that lie deeper than `deep` in others, of those up to HOPS
     contacts away, and of those so deep in a hard wall; −1 for the others; how many; and their
@@ -52,7 +52,7 @@ def deep_cells(memory, found, rows, walls, deep, n):
     return numbers, count, _found_by(memory, numbers, found)
 
 
-@kernel
+@lean
 def _found_by(memory, numbers, found):
     """The contacts `found` of numbered cells."""
     first, second, keep, points, gap = found
@@ -68,14 +68,14 @@ def _found_by(memory, numbers, found):
     return first, second, some[0][:new], some[1][:new], some[2][:new]
 
 
-@kernel
+@lean
 def found_contacts(memory, x, axis, half, radius, margin, dof):
     """Near pairs (first, second), and the contacts among them: see `near_contacts`."""
     pairs = near_pairs(memory, x, axis, half, radius, margin, dof)
     return _contacts_among(memory, x, axis, half, radius, margin, pairs, dof)
 
 
-@kernel
+@lean
 def _contacts_among(memory, x, axis, half, radius, margin, pairs, dof):
     """The contacts among pairs, which are the first two of `pairs`."""
     first, second = pairs[0], pairs[1]
@@ -83,14 +83,14 @@ def _contacts_among(memory, x, axis, half, radius, margin, pairs, dof):
     return first, second, keep, points, gap
 
 
-@kernel
+@lean
 def found_after(memory, x, axis, radius, margin, deep, found, arrays, dof):
     """The contacts after a move, and whether one of them is deeper than `deep`. Where none is, they
     may be those before it, `found`. Puts the half lengths after it into the arrays."""
     length, _, half, _, _, _, y, _, _ = arrays
     for i in range(half.shape[0]):
         half[i] = 0.5 * length[i]
-    if deepest_of(x, axis, half, radius, found, dof) >= -deep:
+    if deepest_of(memory, x, axis, half, radius, found, dof) >= -deep:
         # others were farther than margin: of those that met, one has come half of the way
         together, own = approach(memory, x, length, radius, y, dof)
         some, count = room(memory, own.shape, np.uint8), 0
@@ -108,7 +108,7 @@ def found_after(memory, x, axis, radius, margin, deep, found, arrays, dof):
     return found, _deepest(found[4]) < -deep
 
 
-@kernel
+@lean
 def _deepest(gap):
     deepest = 0.0
     for k in range(gap.shape[0]):

@@ -3,23 +3,27 @@
 A large array that is freed goes back to the system, and comes again page by page: each is cleared
 by the system and entered in its tables, 1 µs for 4 KB. In colonies of 25,000 cells this took a
 quarter of a step. So arrays lie one after the other in `store`, which stays; a kernel gives back
-all that it took since some place at once, by `give_back`. What finds no room is allocated as usual;
-before the next call the store is made as large as it would have had to be.
+all that it took since some place at once, by `give_back`. What finds no room is allocated until the
+call ends; before the next call the store is made as large as it would have had to be. So kernels
+need not count who uses an array, as Numba does.
 """
 
 from __future__ import annotations
 
 import threading
+from typing import Any
 
 import numba
 import numpy as np
 from numba import types
 
-from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.compiling import kernel, lean
 from torchfilm.kernels.lanes import intrinsic
 
-# Places in `marks`: bytes in use, and the most that were; with those that found no room.
-TOP, MOST = range(2)
+# Places in `marks`: bytes in use, and the most that were; with those that found no room. Then the
+# address of what was allocated last, where that of what was allocated before stands.
+TOP, MOST, LAST = range(3)
+MARKS = 3
 # Arrays begin at multiples of so many bytes: lines of the processor's memory.
 LINE = 64
 # A store is made smaller when it is so many bytes, and four times, larger than was needed.
@@ -48,14 +52,37 @@ def _bytes_of(typing, kind):
     return types.int64(kind), emit
 
 
-@kernel
+_allocate: Any = types.ExternalFunction("NRT_Allocate", types.uintp(types.uintp))
+_free: Any = types.ExternalFunction("NRT_Free", types.void(types.uintp))
+
+
+@kernel(inline=True)
+def _word_at(address):
+    return numba.carray(pointer(address, np.int64), (1,))
+
+
+@lean
 def _place(memory, size):
-    """The address of so many bytes, or 0 where there is no room."""
+    """The address of so many bytes."""
     store, marks = memory
     begin = marks[TOP]
     marks[TOP] += (size + LINE - 1) // LINE * LINE
     marks[MOST] = max(marks[MOST], marks[TOP])
-    return store.ctypes.data + begin if marks[TOP] <= store.shape[0] else 0
+    if marks[TOP] <= store.shape[0]:
+        return np.int64(store.ctypes.data) + begin
+    address = np.int64(_allocate(np.uintp(size + 2 * LINE)))
+    _word_at(address)[0] = marks[LAST]
+    marks[LAST] = address
+    return (address + 2 * LINE - 1) // LINE * LINE
+
+
+@kernel(entry=True)
+def free_rest(marks):
+    """Free what was allocated because it found no room."""
+    while marks[LAST] != 0:
+        address = marks[LAST]
+        marks[LAST] = _word_at(address)[0]
+        _free(np.uintp(address))
 
 
 @kernel(inline=True)
@@ -65,10 +92,7 @@ def room(memory, shape, kind):
     size = _bytes_of(kind)
     for k in range(len(shape)):
         size *= shape[k]
-    address = _place(memory, size)
-    if address == 0:
-        return np.empty(shape, kind)
-    return numba.carray(pointer(address, kind), shape)
+    return numba.carray(pointer(_place(memory, size), kind), shape)
 
 
 @kernel(inline=True)
@@ -81,16 +105,16 @@ def zeros(memory, shape, kind):
     return out
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def give_back(memory, top):
     """All arrays taken since `marks[TOP]` was this."""
     memory[1][TOP] = top
 
 
 def no_memory() -> tuple[np.ndarray, np.ndarray]:
-    """A store of no size and its marks: all arrays are allocated as usual, so that Python may have
-    them."""
-    return new_store(0), np.zeros(2, np.int64)
+    """A store of no size and its marks: all arrays are allocated, and stay if nobody frees them, so
+    that Python may have them in a test."""
+    return new_store(0), np.zeros(MARKS, np.int64)
 
 
 def new_store(size: int) -> np.ndarray:
@@ -108,7 +132,11 @@ class KeptMemory(threading.local):
 
     def call(self, function, *given: object) -> None:
         """function((store, marks), *given); then fit the store to what was needed."""
-        function((self.store, self.marks), *given)
+        try:
+            function((self.store, self.marks), *given)
+        finally:
+            if self.marks[LAST] != 0:
+                free_rest(self.marks)
         most, size = int(self.marks[MOST]), self.store.size
         if most > size or 4 * most + ROOMY < size:
             self.store = new_store(most + most // 4)

@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-from torchfilm.kernels.compiling import kernel
-from torchfilm.kernels.memory import room
+from torchfilm.kernels.compiling import lean
+from torchfilm.kernels.memory import room, zeros
 from torchfilm.kernels.rows import degrees
 from torchfilm.kernels.scheme import MAX_TURN
 
 
-@kernel
+@lean
 def drags(length, radius, viscosity, length_drag, growth, scale, dof):
     """M^(−½) of each cell, (n, D). A cell that does not grow is rigid: its length cannot move."""
     D = degrees(dof)
@@ -26,7 +26,7 @@ def drags(length, radius, viscosity, length_drag, growth, scale, dof):
         scale[i, D - 1] = 1.0 / math.sqrt(length_drag[i]) if growth[i] > 0 else 0.0
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def rotate(axis, i, tx, ty, tz, angle, dof):
     """Rotate the unit axis of cell i, in place, by a rotation vector of this size; in the plane by
     the angle tx."""
@@ -50,7 +50,7 @@ def rotate(axis, i, tx, ty, tz, angle, dof):
         axis[i, 0], axis[i, 1], axis[i, 2] = bx / size, by / size, bz / size
 
 
-@kernel
+@lean
 def move_cells(x, axis, length, y, scale, about, bound, least, dof):
     """Carry out the move y, its translation at most `bound` from `about` (n, D), and its rotation
     at most `bound` at the ends. Returns how many were cut short."""
@@ -83,7 +83,7 @@ def move_cells(x, axis, length, y, scale, about, bound, least, dof):
     return clipped
 
 
-@kernel
+@lean
 def approach(memory, x, length, radius, y, dof):
     """How much nearer, at most, cells can have come by the move y of `move_cells`, µm: any two that
     are near, and what each adds to that, (n,).
@@ -92,7 +92,8 @@ def approach(memory, x, length, radius, y, dof):
     their distance, and the rest is what each moves by itself.
     """
     n, d, end = x.shape[0], 2 if len(dof) == 4 else 3, degrees(dof) - 1
-    centre, mean, longest = np.zeros(d), np.zeros(d), 0.0
+    centre, mean = zeros(memory, (d,), np.float64), zeros(memory, (d,), np.float64)
+    longest = 0.0
     for i in range(n):
         longest = max(longest, length[i] + 2 * radius[i])
         for k in range(d):

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from torchfilm.kernels.compiling import index, kernel
+from torchfilm.kernels.compiling import index, kernel, lean
 from torchfilm.kernels.lanes import boxes_meet, copy_row
 from torchfilm.kernels.memory import room, zeros
 
@@ -25,14 +25,15 @@ def _boxes(memory, x, axis, half, radius, margin, box, low, high, dof):
     bins."""
     n, d, other = x.shape[0], 2 if len(dof) == 4 else 3, len(dof) // 2
     size, ends = 0.0, room(memory, (n, d), np.float64)
-    least = np.full(d, np.inf)
+    least, top = room(memory, (d,), np.float64), zeros(memory, (3,), np.int64)
+    for k in range(d):
+        least[k] = np.inf
     for i in range(n):
         for k in range(d):
             ends[i, k] = e = abs(axis[i, k]) * half[i] + radius[i] + 0.5 * margin
             size += e
             least[k] = min(least[k], x[i, k] - e)
     width = 3.2 * size / (n * d)  # wider: fewer bins a cell, but more cells a bin
-    top = np.zeros(3, np.int64)
     for i in range(n):
         for k in range(d):
             start, end = x[i, k] - ends[i, k] - least[k], x[i, k] + ends[i, k] - least[k]
@@ -58,7 +59,7 @@ def _slots_of(memory, low, high, top, slots, some):
     return used
 
 
-@kernel
+@lean
 def _fill_table(memory, low, high, top, used, boxes, dof):
     """Members sorted by slot, of the slots that are used, and where each slot begins. Each has 8
     times the number of its bin, and a bit for each axis along which this is the first bin of its
@@ -97,17 +98,17 @@ def _fill_table(memory, low, high, top, used, boxes, dof):
     return begin, member, key, box
 
 
-@kernel
+@lean
 def near_pairs(memory, x, axis, half, radius, margin, dof):
     """Pairs (i < j) whose boxes come nearer than margin, and a few more, each once, sorted by i.
 
     Cells of any size: a long cell lies in many bins. A pair is found in the first bin that both
     cover: along each axis it is the first of one of them.
     """
-    return near_pairs_of(memory, x, axis, half, radius, margin, np.empty(0, np.uint8), dof)
+    return near_pairs_of(memory, x, axis, half, radius, margin, room(memory, (0,), np.uint8), dof)
 
 
-@kernel
+@lean
 def near_pairs_of(memory, x, axis, half, radius, margin, some, dof):
     """Those of `near_pairs` of which a cell is marked in `some`, (n,) uint8; (0,) for all."""
     n, d = x.shape[0], 2 if len(dof) == 4 else 3
@@ -141,7 +142,7 @@ def near_pairs_of(memory, x, axis, half, radius, margin, some, dof):
     return _by_first(memory, first, second, n)
 
 
-@kernel
+@lean
 def _with_some(first, second, some):
     """The pairs of which a cell is marked in `some`, in place; all where it is (0,)."""
     if some.shape[0] == 0:
@@ -153,7 +154,7 @@ def _with_some(first, second, some):
     return first[:new], second[:new]
 
 
-@kernel
+@lean
 def _among_few(memory, boxes, dof):
     """The pairs of boxes that meet, each compared with each."""
     n, found = boxes.shape[0], index(0)
@@ -165,7 +166,7 @@ def _among_few(memory, boxes, dof):
     return first[:found], second[:found]
 
 
-@kernel
+@lean
 def _search(table, slot, place, found, most, first, second, dof):
     """Puts pairs of the members from `place` on, in this slot and the next ones, after the first
     `found`, as long as there is room for `most` more. Returns slot and place to go on from, and how
@@ -195,7 +196,7 @@ def _longer(memory, a):
     return out
 
 
-@kernel
+@lean
 def _by_first(memory, first, second, n):
     """The pairs sorted by their first cell, otherwise in order."""
     m = first.shape[0]

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from torchfilm.kernels.compiling import index, kernel
+from torchfilm.kernels.compiling import index, lean
 from torchfilm.kernels.memory import room, zeros
 
 FLAT, INSIDE, OUTSIDE = 0, 1, 2
@@ -19,14 +19,14 @@ FLAT, INSIDE, OUTSIDE = 0, 1, 2
 HARD, STIFF, LIGHT, FAR = 0, 1, 2, 3
 
 
-@kernel
+@lean
 def degrees(dof):
     """The degrees of freedom of a cell, of which the last is its length: 4 in the plane, 7 in
     space. `dof` is a tuple of as many entries as rows have columns, 4 or 8: see `lanes`."""
     return 4 if len(dof) == 4 else 7
 
 
-@kernel
+@lean
 def deeply_overlapping(memory, found, radius):
     """How many cells lie deeper in another than a radius."""
     first, second, keep, _, gap = found
@@ -38,7 +38,7 @@ def deeply_overlapping(memory, found, radius):
     return deeply.sum()
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def half_of(weight, s, end, nx, ny, nz, ax, ay, az, dof):
     """One half of a row before it is scaled: weight · (n, q × n, ∂) for a point at arc length s. Of
     numbers, or of vectors."""
@@ -54,7 +54,7 @@ def half_of(weight, s, end, nx, ny, nz, ax, ay, az, dof):
     )  # fmt: skip
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _put_half(H, h, i, weight, s, end, nx, ny, nz, axis, scale, dof):
     """One half of a row, at a wall."""
     az = axis[i, 2] if len(dof) == 8 else 0.0
@@ -65,7 +65,7 @@ def _put_half(H, h, i, weight, s, end, nx, ny, nz, axis, scale, dof):
         H[h, 7] = 0.0
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def wall_gap(kind, place, size, px, py, pz):
     """Distance of a point to a wall, µm, and the direction to the wall.
 
@@ -84,7 +84,7 @@ def wall_gap(kind, place, size, px, py, pz):
     return distance - size, -wx, -wy, -wz
 
 
-@kernel
+@lean
 def wall_rows(x, axis, half, radius, scale, kinds, places, sizes, roots, reach, rows, is_soft, hold,
               dof):  # fmt: skip
     """Rows (H, gaps, one, two, soft) of cells nearer to a wall than reach (n,).
@@ -133,7 +133,7 @@ def wall_rows(x, axis, half, radius, scale, kinds, places, sizes, roots, reach, 
     return r, deepest
 
 
-@kernel
+@lean
 def rows_among(H, gaps, one, two, soft, rows, number):
     """Keep the rows of the numbered cells, in place; the others are at rest. Returns how many."""
     new = 0
@@ -152,7 +152,7 @@ def rows_among(H, gaps, one, two, soft, rows, number):
     return new
 
 
-@kernel
+@lean
 def rows_of_cells(memory, one, two, rows, n):
     """The halves of each cell, in the order of rows: where each cell's begin, and the halves."""
     begin = zeros(memory, (n + 1,), np.int64)

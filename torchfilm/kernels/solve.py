@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.compiling import kernel, lean
 from torchfilm.kernels.memory import room, zeros
 from torchfilm.kernels.rows import degrees, rows_of_cells
 from torchfilm.kernels.scheme import CREEP, FORCING, LEVEL, MOST_LOOKS, MOST_ROUNDS
@@ -58,7 +58,7 @@ from torchfilm.kernels.solve_pieces import (
 from torchfilm.kernels.team import BLOCK, pieces_for, share_out
 
 
-@kernel(any_order=True)
+@lean(any_order=True)
 def _slope(e, q, t):
     """The slope of the rows' energy after a share t of a step that changes them by −q, and its
     derivative."""
@@ -71,7 +71,7 @@ def _slope(e, q, t):
     return slope, curvature
 
 
-@kernel
+@lean
 def search_line(e, q, c0, c1, most):
     """How far to go along a step, at most `most`: until the slope is at most LEVEL of that at 0.
     And how far E falls."""
@@ -97,7 +97,7 @@ def search_line(e, q, c0, c1, most):
     return t, -0.5 * slope0 * t
 
 
-@kernel(any_order=True)
+@lean(any_order=True)
 def _squared_overlap(e, cap):
     """The sum of squared overlaps, each counted up to `cap`."""
     overlap = 0.0
@@ -107,7 +107,7 @@ def _squared_overlap(e, cap):
     return overlap
 
 
-@kernel(any_order=True)
+@lean(any_order=True)
 def _work_of(pushed, q):
     """Σ pushed · q."""
     total = 0.0
@@ -116,7 +116,7 @@ def _work_of(pushed, q):
     return total
 
 
-@kernel
+@lean
 def cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof):
     """Go along the direction p: d += t p, and g becomes the gradient there and z = P⁻¹ g. z is 0
     before; rz: g · P⁻¹ g before. Returns g · z."""
@@ -130,7 +130,7 @@ def cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof):
     return new
 
 
-@kernel
+@lean
 def _shared_cg_step(team, rz, t):
     """As `cg_step`, by a team."""
     share_out(team, PRODUCT)
@@ -139,7 +139,7 @@ def _shared_cg_step(team, rz, t):
     return total_of(team, 0)
 
 
-@kernel
+@lean
 def _conjugate_gradients(H, one, two, on, alpha, inverse, g, z, p, d, gz, limit, t, team, dof):
     """d = −(JᵀAJ + α)⁻¹ g, to FORCING of the residual, from `first_direction`; g becomes the
     residual. t: (1,). Returns iterations."""
@@ -160,12 +160,12 @@ def _conjugate_gradients(H, one, two, on, alpha, inverse, g, z, p, d, gz, limit,
     return count
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _hold(work):
     """Arrays whose addresses a team has must not be freed before this."""
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _put_gaps(H, one, two, e, q, v, pushed, act, stale, y, t, team, dof):
     """The gaps after the move y, and the rows' forces."""
     t[0] = 1.0
@@ -177,7 +177,7 @@ def _put_gaps(H, one, two, e, q, v, pushed, act, stale, y, t, team, dof):
     put_forces(e, pushed, v, one, two, act, stale, 0, e.shape[0])
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _put_gradient(H, one, two, v, pushed, act, stale, alpha, low, y, g, z, d, p, inverse, slope,
                   own, begin, halves, lengths, on, counts, team, dof):  # fmt: skip
     """The gradient, the blocks and the first direction of CG. Returns g · P⁻¹ g, and the same of
@@ -201,7 +201,7 @@ def _put_gradient(H, one, two, v, pushed, act, stale, alpha, low, y, g, z, d, p,
     return gz, of_alone
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _bounded(H, one, two, q, alpha, low, y, d, slope, own, lengths, team, dof):
     """Bound the step d, and put its change of gaps into q. Returns how far all may go along it, and
     the slope and curvature that drags give."""
@@ -219,7 +219,7 @@ def _bounded(H, one, two, q, alpha, low, y, d, slope, own, lengths, team, dof):
     return most, c0, c1
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def _advance(one, two, e, q, v, pushed, act, stale, low, y, d, lengths, share, t, team, dof):
     """Go `share` of the step d, and put the rows' forces."""
     t[0] = share
@@ -263,7 +263,7 @@ def _copied(memory, gaps, rows):
     return out
 
 
-@kernel
+@lean
 def _error(fall, left, overlap, cap):
     """The relative error that is left."""
     if left == 0.0:  # solved exactly
@@ -274,30 +274,12 @@ def _error(fall, left, overlap, cap):
     return math.sqrt(max(fall, left, 0.0) / (overlap if overlap > 0 else cap * cap))
 
 
-@kernel
-def minimise(
-    memory, H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, limit, team, dof
-):
-    """Minimise E from y, in place.
-
-    pushed: what soft rows have already exerted in this step, (rows,); or (0,) for nothing. low:
-    (n,) least scaled Δl, at most 0. team: a board, or (0,) where this thread is alone. Stops when
-    the error that is left, estimated by the fall of E in the last round and by the residual, is at
-    most `tolerance` of the contacts' overlap: root mean square, overlaps counted up to `cap` (µm),
-    so that what has not converged does not loosen the rule. Returns iterations, that relative
-    error, and each row's gap after the move.
-    """
+@lean
+def _rounds(work, tolerance, cap, limit, team, dof):
+    """The rounds of `minimise`. Returns iterations and the relative error that is left."""
+    (H, one, two, e, q, v, pushed, act, stale, alpha, low, y, g, z, d, p, inverse, slope, own,
+     begin, halves, lengths, _, _, on, counts, _, t) = work  # fmt: skip
     n, D = y.shape[0], degrees(dof)
-    if not overlaps(gaps, rows):  # nothing pushes: such a colony does not move at all
-        y[:] = 0
-        return 0, 0.0, _copied(memory, gaps, rows)
-    pieces = pieces_for(team, n)
-    team = team[: 0 if pieces == 1 else team.shape[0]]
-    work = _work(memory, H, one, two, rows, gaps, pushed, alpha, low, y, pieces, dof)
-    if pieces > 1:
-        put_on_board(team, work, n, rows)
-    (_, one, two, e, q, v, _, act, stale, _, _, _, g, z, d, p, inverse, slope, own, begin, halves,
-     lengths, _, _, on, counts, _, t) = work  # fmt: skip
     for i in range(n):
         y[i, D - 1] = max(y[i, D - 1], low[i])
     total, fall, error, stuck = 0, np.inf, 0.0, 0
@@ -325,5 +307,31 @@ def minimise(
         _advance(
             one, two, e, q, v, pushed, act, stale, low, y, d, lengths, share, t, team, dof
         )  # fmt: skip
+    return total, error
+
+
+@lean
+def minimise(
+    memory, H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, limit, team, dof
+):
+    """Minimise E from y, in place.
+
+    pushed: what soft rows have already exerted in this step, (rows,); or (0,) for nothing. low:
+    (n,) least scaled Δl, at most 0. team: a board, or (0,) where this thread is alone. Stops when
+    the error that is left, estimated by the fall of E in the last round and by the residual, is at
+    most `tolerance` of the contacts' overlap: root mean square, overlaps counted up to `cap` (µm),
+    so that what has not converged does not loosen the rule. Returns iterations, that relative
+    error, and each row's gap after the move.
+    """
+    n = y.shape[0]
+    if not overlaps(gaps, rows):  # nothing pushes: such a colony does not move at all
+        y[:] = 0
+        return 0, 0.0, _copied(memory, gaps, rows)
+    pieces = pieces_for(team, n)
+    team = team[: 0 if pieces == 1 else team.shape[0]]
+    work = _work(memory, H, one, two, rows, gaps, pushed, alpha, low, y, pieces, dof)
+    if pieces > 1:
+        put_on_board(team, work, n, rows)
+    total, error = _rounds(work, tolerance, cap, limit, team, dof)
     _hold(work)
-    return total, error, e
+    return total, error, work[3]

@@ -6,14 +6,14 @@ the share of a block of cells: see `team`.
 
 from __future__ import annotations
 
-from torchfilm.kernels.compiling import index, kernel
+from torchfilm.kernels.compiling import index, kernel, lean
 from torchfilm.kernels.lanes import add_scaled, dot, dot_row, put_inverse, put_product
 from torchfilm.kernels.memory import room
 from torchfilm.kernels.rows import degrees
 from torchfilm.kernels.scheme import RAISED, ROUNDING
 
 
-@kernel
+@lean
 def times_rows(H, one, two, p, q, first, end, dof):
     """q = J p of the rows first … end − 1. Here and below two[r] is one[r] for rows of one cell,
     whose second half is 0."""
@@ -22,7 +22,7 @@ def times_rows(H, one, two, p, q, first, end, dof):
         q[r] = dot_row(H, first + r, p, one[r], two[r], dof)
 
 
-@kernel
+@lean
 def add_forces(H, one, two, of, v, out, dof):
     """out += Jᵀ v of the rows `of`."""
     for h in of:
@@ -31,7 +31,7 @@ def add_forces(H, one, two, of, v, out, dof):
         add_scaled(out, two[r], v[r], H, 2 * h + 1, dof)
 
 
-@kernel
+@lean
 def add_own_forces(H, one, two, of, v, out, first, end, dof):
     """As `add_forces`, to the cells first … end − 1 alone."""
     for h in of:
@@ -42,7 +42,7 @@ def add_own_forces(H, one, two, of, v, out, first, end, dof):
             add_scaled(out, two[r], v[r], H, 2 * h + 1, dof)
 
 
-@kernel
+@lean
 def add_product(H, one, two, on, p, out, dof):
     """out += Jᵀ J p of the rows `on`."""
     for r in on:
@@ -52,7 +52,7 @@ def add_product(H, one, two, on, p, out, dof):
         add_scaled(out, j, t, H, h + 1, dof)
 
 
-@kernel
+@lean
 def add_own_product(H, one, two, on, p, out, first, end, dof):
     """As `add_product`, to the cells first … end − 1 alone."""
     for r in on:
@@ -64,7 +64,7 @@ def add_own_product(H, one, two, on, p, out, first, end, dof):
             add_scaled(out, j, t, H, h + 1, dof)
 
 
-@kernel
+@lean
 def refresh_blocks(H, begin, halves, act, alpha, y, low, g, lengths, own, inverse, stale, first,
                    end, dof):  # fmt: skip
     """Hold the lengths at their bound that are pushed further, and those that step alone; invert
@@ -85,7 +85,7 @@ def refresh_blocks(H, begin, halves, act, alpha, y, low, g, lengths, own, invers
             stale[i] = 0
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def put_scaled(g, alpha, y, first, end, dof):
     """g = α y."""
     for i in range(first, end):
@@ -94,7 +94,7 @@ def put_scaled(g, alpha, y, first, end, dof):
         add_scaled(g, i, alpha[i], y, i, dof)
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def precondition(inverse, g, z, first, end, dof):
     """z = P⁻¹ g; returns g · z."""
     total = 0.0
@@ -104,7 +104,7 @@ def precondition(inverse, g, z, first, end, dof):
     return total
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def add_curvature(alpha, z, p, first, end, dof):
     """z += α p; returns p · z."""
     total = 0.0
@@ -114,7 +114,7 @@ def add_curvature(alpha, z, p, first, end, dof):
     return total
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def go_along(d, g, z, p, inverse, t, first, end, dof):
     """d += t p, g += t z and z = P⁻¹ g; returns g · z."""
     total = 0.0
@@ -126,7 +126,7 @@ def go_along(d, g, z, p, inverse, t, first, end, dof):
     return total
 
 
-@kernel
+@lean
 def next_direction(p, z, t, first, end):
     """p = t p − z, and z = 0."""
     a, b = first * p.shape[1], end * p.shape[1]
@@ -136,7 +136,7 @@ def next_direction(p, z, t, first, end):
         z[k] = 0
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def first_direction(d, p, z, first, end):
     """d = 0, p = −z, and z = 0."""
     a, b = first * p.shape[1], end * p.shape[1]
@@ -145,7 +145,7 @@ def first_direction(d, p, z, first, end):
         d[k], p[k], z[k] = 0, -z[k], 0
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def put_slopes(g, lengths, slope, own, first, end, dof):
     """The slopes of lengths; returns how far E may fall by the steps of those that step alone."""
     last, total = degrees(dof) - 1, 0.0
@@ -156,7 +156,7 @@ def put_slopes(g, lengths, slope, own, first, end, dof):
     return total
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def stop_at_bounds(y, d, low, lengths, slope, own, first, end, dof):
     """Shorten the step d (n, D) of the lengths that would pass their bound; those that step alone
     follow their slope. Returns how far all may go along the step."""
@@ -174,7 +174,7 @@ def stop_at_bounds(y, d, low, lengths, slope, own, first, end, dof):
     return most
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def of_drag(alpha, y, d, first, end, dof):
     """α y · d and α d · d."""
     slope, curvature = 0.0, 0.0
@@ -184,7 +184,7 @@ def of_drag(alpha, y, d, first, end, dof):
     return slope, curvature
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def advance(y, d, low, lengths, creeps, share, first, end, dof):
     """Go `share` (1,) of the step d; lengths at their bound are put on it. creeps: those that were
     stopped step alone next."""
@@ -196,7 +196,7 @@ def advance(y, d, low, lengths, creeps, share, first, end, dof):
             y[i, last] = low[i]
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def advance_rows(e, q, share, first, end):
     """What rows leave, e, after `share` (1,) of a step that changes them by −q."""
     e, q, t = e[first:end], q[first:end], share[0]
@@ -204,7 +204,7 @@ def advance_rows(e, q, share, first, end):
         e[r] -= t * q[r]
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def put_forces(e, pushed, v, one, two, act, stale, first, end):
     """v = the force of each row, less what it has exerted before: `pushed`, or (0,) for nothing.
     Marks which rows push, or are no number; cells whose rows change are stale."""
@@ -221,7 +221,7 @@ def put_forces(e, pushed, v, one, two, act, stale, first, end):
         v[r] -= pushed[r]
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def keep_pushing(act, rows, on):
     """Puts those of the rows that push into `on`; returns how many."""
     count = 0
@@ -244,7 +244,7 @@ def second_cells(memory, H, one, two, rows):
     return other
 
 
-@kernel
+@lean
 def overlaps(gaps, rows):
     """Whether one of the rows is of an overlap."""
     some = False

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchfilm.kernels import solve_parts as parts
-from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.compiling import kernel, lean
 from torchfilm.kernels.memory import room, zeros
 from torchfilm.kernels.team import BLOCK, LOOP, NUMBERS, PIECES, array_at, range_of
 
@@ -21,7 +21,7 @@ N, ROWS, CREEPS, FREE = range(NUMBERS, NUMBERS + 4)
 ) = range(NUMBERS + 4, NUMBERS + 32)  # fmt: skip
 
 
-@kernel
+@lean
 def rows_of_pieces(memory, one, two, rows, n, pieces):
     """The rows of the cells of each piece, in their order: where each piece's begin, and the rows.
     A row of two pieces stands in both. No rows where there are no pieces."""
@@ -38,7 +38,9 @@ def rows_of_pieces(memory, one, two, rows, n, pieces):
         begin[b + 1] += a != b
     for k in range(pieces):
         begin[k + 1] += begin[k]
-    fill, mine = begin[:-1].copy(), room(memory, (begin[pieces],), np.int32)
+    fill, mine = room(memory, (pieces,), np.int64), room(memory, (begin[pieces],), np.int32)
+    for k in range(pieces):
+        fill[k] = begin[k]
     for r in range(rows):
         a, b = owner[one[r] // BLOCK], owner[two[r] // BLOCK]
         mine[fill[a]] = r
@@ -49,7 +51,7 @@ def rows_of_pieces(memory, one, two, rows, n, pieces):
     return begin, mine
 
 
-@kernel
+@lean
 def put_on_board(board, work, n, rows):
     """Tell the team where the arrays are: `work`, in the order of their places. They must be kept
     as long as the team works on them."""
@@ -98,7 +100,7 @@ def _sums(board):
     return array_at(board, SUMS, np.float64, (3, (board[N] + BLOCK - 1) // BLOCK))
 
 
-@kernel
+@lean
 def _of_rows(board, loop, k, like, dof):
     """A piece of GAPS, CHANGES or ADVANCE: the rows."""
     rows, pieces = board[ROWS], board[PIECES]
@@ -116,7 +118,7 @@ def _of_rows(board, loop, k, like, dof):
         parts.put_forces(e, pushed, v, one, two, act, stale, first, end)
 
 
-@kernel
+@lean
 def _of_cells(board, k, like, dof):
     """A piece of CELLS."""
     n, rows = board[N], board[ROWS]
@@ -150,7 +152,7 @@ def _of_cells(board, k, like, dof):
     parts.first_direction(d, p, z, first, end)
 
 
-@kernel
+@lean
 def _of_product(board, k, like, dof):
     """A piece of PRODUCT."""
     first, end = range_of(k, board[PIECES], board[N])
@@ -166,7 +168,7 @@ def _of_product(board, k, like, dof):
         sums[0, a // BLOCK] = parts.add_curvature(alpha, z, p, a, b, dof)
 
 
-@kernel
+@lean
 def _of_step(board, loop, k, like, dof):
     """A piece of ALONG or DIRECTION."""
     n = board[N]
@@ -183,7 +185,7 @@ def _of_step(board, loop, k, like, dof):
         sums[0, a // BLOCK] = parts.go_along(d, g, z, p, inverse, t, a, b, dof)
 
 
-@kernel
+@lean
 def _of_move(board, loop, k, like, dof):
     """A piece of BOUNDS or ADVANCE: the cells."""
     n = board[N]
@@ -202,7 +204,7 @@ def _of_move(board, loop, k, like, dof):
         sums[0, a // BLOCK], sums[1, a // BLOCK] = parts.of_drag(alpha, y, d, a, b, dof)
 
 
-@kernel
+@lean
 def do_piece(board, k, like, dof):
     """Do piece k of the loop that is offered."""
     loop = board[LOOP]
@@ -218,7 +220,7 @@ def do_piece(board, k, like, dof):
         _of_rows(board, loop, k, like, dof)
 
 
-@kernel
+@lean
 def total_of(board, k):
     """The sum over blocks of cells, in their order, of what a loop left in row k of its sums."""
     sums, total = _sums(board), 0.0
@@ -227,7 +229,7 @@ def total_of(board, k):
     return total
 
 
-@kernel
+@lean
 def least_of(board):
     """How far all cells may go along a step, after BOUNDS."""
     sums, most = _sums(board), np.inf

@@ -22,7 +22,7 @@ from torchfilm.kernels.colonies import (
     shortest_of,
     taken_out,
 )
-from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.compiling import kernel, lean
 from torchfilm.kernels.contacts import most_rows, pair_rows
 from torchfilm.kernels.found import deep_cells, found_after, found_contacts
 from torchfilm.kernels.memory import TOP, give_back, room, zeros
@@ -52,7 +52,7 @@ from torchfilm.kernels.team import next_of
 DEEP, TOLERANCE, MOST_PASSES, LIMIT, SOFT, YIELD = range(6)
 
 
-@kernel
+@lean
 def _wall_contacts(memory, x, axis, half, radius, scale, at, found, like, dof):
     """Rows (H, gaps, one, two, soft) of cells at walls, with room for those of the contacts
     `found`; how many there are, and the deepest gap. at: kinds, places and sizes of walls and
@@ -68,7 +68,7 @@ def _wall_contacts(memory, x, axis, half, radius, scale, at, found, like, dof):
     return rows, walls, deepest
 
 
-@kernel
+@lean
 def _numbers(x, length, scale, growth, least, last, first_pass, hardness, softer, roots, is_soft,
              alphas, margin, alpha, low, reach, root, dof):  # fmt: skip
     """α, the least scaled Δl, reach of walls and weight of walls of each cell."""
@@ -84,7 +84,7 @@ def _numbers(x, length, scale, growth, least, last, first_pass, hardness, softer
             root[w, i] = math.sqrt(roots[w, i] * alpha[i]) if is_soft[w] else roots[w, i]
 
 
-@kernel
+@lean
 def _put_start(y, last, scale, first_pass, rising):
     """Puts the scaled move from which a pass starts into y: the last one, or that of a repeated
     pass, 0. A solve with harder contacts than the one before starts from that: not `rising`."""
@@ -93,7 +93,7 @@ def _put_start(y, last, scale, first_pass, rising):
             y[i, k] = last[i, k] / scale[i, k] if first_pass and scale[i, k] > 0 else 0.0
 
 
-@kernel
+@lean
 def _minimise_some(
     memory, rows, m, numbers, count, alpha, low, y, cap, settings, report, team, dof
 ):
@@ -134,7 +134,7 @@ def _minimise_some(
     return error, e
 
 
-@kernel
+@lean
 def _arrays(memory, base, growth, shortest, last, roots):
     """Lengths after growth, the least that pressure leaves, and their halves, (n,); then arrays for
     a pass: reach of walls, their weights, α, least scaled Δl, scale, the move, one that is kept,
@@ -153,7 +153,7 @@ def _arrays(memory, base, growth, shortest, last, roots):
     return length, least, half, of_walls, of_cells, scale, y, kept, about
 
 
-@kernel
+@lean
 def _prepared(memory, x, axis, growth, radius, viscosity, length_drag, last, first_pass, rising,
               hardness, softer, walls, roots, alphas, margin, found, arrays, dof):  # fmt: skip
     """Puts what a pass starts from into its arrays. Returns rows of cells at walls, with room for
@@ -169,7 +169,7 @@ def _prepared(memory, x, axis, growth, radius, viscosity, length_drag, last, fir
     return _wall_contacts(memory, x, axis, half, radius, scale, at, found, last, dof)
 
 
-@kernel
+@lean
 def step_colony(memory, x, axis, base, growth, radius, viscosity, length_drag, shortest, last,
                 hardness, walls, roots, alphas, settings, report, team, dof):  # fmt: skip
     """Grow one colony by `growth` and part what overlaps; x, axis, base, last, hardness in place.
@@ -238,13 +238,13 @@ def step_colony(memory, x, axis, base, growth, radius, viscosity, length_drag, s
     _put_lengths(length, base)
 
 
-@kernel
+@lean
 def _put_lengths(length, base):
     for i in range(base.shape[0]):
         base[i] = length[i]
 
 
-@kernel
+@lean
 def _carried_out(x, axis, last, pushed, margin, first_pass, arrays, dof):
     """Carry out the move, which is bounded about the last one; but without a push nothing moves.
     That of the first pass becomes the last one. Returns how many cells were cut short."""
@@ -258,21 +258,21 @@ def _carried_out(x, axis, last, pushed, margin, first_pass, arrays, dof):
     return clipped
 
 
-@kernel
+@lean
 def _solved(memory, x, axis, radius, found, rows, walls, deep, far, some, arrays, cap, settings,
             report, team, dof):  # fmt: skip
     """Solve a pass, of which `walls` rows are made: for all cells, or for `some`, those that lie
     deep. Returns the error, each row's gap after the move, and how many rows there are."""
     _, _, half, _, (alpha, low), scale, y, _, _ = arrays
     numbers, count, mine = deep_cells(memory, found, rows, walls, deep, len(y) * some)
-    m = pair_rows(x, axis, half, radius, scale, mine, walls, rows, far, dof)
+    m = pair_rows(memory, x, axis, half, radius, scale, mine, walls, rows, far, dof)
     error, e = _minimise_some(
         memory, rows, m, numbers, count, alpha, low, y, cap, settings, report, team, dof
     )
     return error, e, m
 
 
-@kernel
+@lean
 def _noted(report, error, tolerance):
     """Report a pass. Returns whether its move is a number."""
     report[PASSES] += 1
@@ -284,7 +284,7 @@ def _noted(report, error, tolerance):
     return error < np.inf
 
 
-@kernel
+@lean
 def _of_colony(base, growth, radius, viscosity, settings):
     """The margin, the overlap that is wanted, how deep is too deep, all µm, the α of the softest
     contacts, and the most passes."""
@@ -298,7 +298,7 @@ def _of_colony(base, growth, radius, viscosity, settings):
     return MARGIN * wide, settings[YIELD] * wide, deep, softest, passes
 
 
-@kernel
+@lean
 def _following(e, soft, hardness, target, softest):
     """α at which the mean overlap of the contacts that push, with cells and with hard walls, is
     `target`, µm: harder at once, softer by a factor of two a step. Rows at the ends of stretches do

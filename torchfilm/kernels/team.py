@@ -20,7 +20,7 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 
-from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.compiling import kernel, lean
 from torchfilm.kernels.lanes import intrinsic, long_of
 from torchfilm.kernels.memory import pointer
 
@@ -49,7 +49,7 @@ if AVAILABLE:
     _give_way: Any = types.ExternalFunction("sched_yield", types.int32())
 else:
 
-    @kernel
+    @lean
     def _give_way():
         return 0
 
@@ -110,7 +110,7 @@ def exchange(typing, board, k, old, new):
     return types.boolean(board, k, old, new), emit
 
 
-@kernel
+@lean
 def next_of(which, taken):
     """The first of the numbers `which` that no thread has taken, or −1. taken: (1,) int64, how many
     have been."""
@@ -154,7 +154,7 @@ def _call_taker(typing, function, board):
     return types.int64(function, board), emit
 
 
-@kernel
+@lean
 def share_out(board, loop):
     """Do a loop together with those who assist."""
     board[LOOP] = loop
@@ -168,7 +168,7 @@ def share_out(board, loop):
             _give_way()
 
 
-@kernel
+@lean
 def take(board, leads):
     """Take a piece that nobody has: the first one, or −1 where there is none; or, as soon as there
     is one, the last, or −1 when there will be no more."""
@@ -189,7 +189,7 @@ def take(board, leads):
                 _give_way()
 
 
-@kernel
+@lean
 def pieces_for(board, n):
     """Pieces of the loops over n cells; 1 where one thread does better."""
     if board.shape[0] == 0 or n < board[LEAST]:
@@ -197,7 +197,7 @@ def pieces_for(board, n):
     return min((n + BLOCK - 1) // BLOCK, PIECES_A_THREAD * board[THREADS])
 
 
-@kernel(inline=True)
+@lean(inline=True)
 def range_of(k, pieces, n):
     """The first of the cells of piece k, in whole blocks, and one more than the last."""
     blocks = (n + BLOCK - 1) // BLOCK
