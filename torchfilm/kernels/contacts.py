@@ -21,8 +21,9 @@ from torchfilm.kernels.capsules import (
     squared_sine,
 )
 from torchfilm.kernels.compiling import index, lean
-from torchfilm.kernels.memory import room, zeros
-from torchfilm.kernels.rows import FAR, HARD, degrees, half_of
+from torchfilm.kernels.lanes import put_scaled_row, put_turned
+from torchfilm.kernels.memory import room, shaped, zeros
+from torchfilm.kernels.rows import FAR, HARD, half_of
 from torchfilm.kernels.scheme import BEYOND
 from torchfilm.kernels.vectors import WIDTH, any_of, load, store, where
 
@@ -39,11 +40,11 @@ VECTORS = PAIRS // WIDTH
 B, A, C = 0, 3, 6
 HALF_A, HALF_B, RADIUS_A, RADIUS_B, S0, T0, GAP, NEAR, HAS = range(9, 18)
 ROWS = 4
-# Then, of each row: arc lengths, ends, weight, distance, gap times weight, and the halves, which
-# have up to seven columns.
+# Then, of each row: arc lengths, ends, weight, distance, gap times weight; and room for the halves,
+# of up to eight numbers, those of one pair after those of the other.
 FIRST_ROW = HAS + ROWS
-S, T, END_A, END_B, WEIGHT, DISTANCE, WEIGHTED, OWN, OTHER = (0, 1, 2, 3, 4, 5, 6, 7, 14)
-OF_ROW = 21
+S, T, END_A, END_B, WEIGHT, DISTANCE, WEIGHTED, OWN, OTHER = (0, 1, 2, 3, 4, 5, 6, 7, 15)
+OF_ROW = 23
 COLUMNS = FIRST_ROW + ROWS * OF_ROW
 
 
@@ -61,6 +62,12 @@ def _put_cells(block, k, i, j, x, axis, half, radius, dof):
         block[A + c, k], block[C + c, k] = axis[i, c], axis[j, c]
     block[HALF_A, k], block[HALF_B, k] = half[i], half[j]
     block[RADIUS_A, k], block[RADIUS_B, k] = radius[i], radius[j]
+
+
+@lean(inline=True)
+def _half_at(column, k, dof):
+    """The place of the half of pair k among the numbers of a block."""
+    return index(column) * index(PAIRS) + index(k) * index(len(dof))
 
 
 @lean(inline=True)
@@ -107,7 +114,9 @@ def near_contacts(memory, x, axis, half, radius, first, second, margin, dof):
         for k in range(count):
             i, j = index(first[start + k]), index(second[start + k])
             _put_cells(block, k, i, j, x, axis, half, radius, dof)
-        _measure(block.reshape(-1, WIDTH), (count + WIDTH - 1) // WIDTH, margin, dof)
+        _measure(
+            shaped(block, (FIRST_ROW * VECTORS, WIDTH)), (count + WIDTH - 1) // WIDTH, margin, dof
+        )
         for k in range(count):  # without branches: their outcome is not foreseen
             keep[found], gap[found] = start + k, block[GAP, k]
             points[found, 0], points[found, 1] = block[S0, k], block[T0, k]
@@ -126,7 +135,12 @@ def deepest_of(memory, x, axis, half, radius, found, dof):
         for k in range(some.shape[0]):
             i, j = index(first[index(some[k])]), index(second[index(some[k])])
             _put_cells(block, k, i, j, x, axis, half, radius, dof)
-        _measure(block.reshape(-1, WIDTH), (some.shape[0] + WIDTH - 1) // WIDTH, 0.0, dof)
+        _measure(
+            shaped(block, (FIRST_ROW * VECTORS, WIDTH)),
+            (some.shape[0] + WIDTH - 1) // WIDTH,
+            0.0,
+            dof,
+        )
         for k in range(some.shape[0]):
             deepest = min(deepest, block[GAP, k])
     return deepest
@@ -177,9 +191,8 @@ def _put_row(rows, row, g, s, t, end_a, end_b, weight, dof):
     end_b = _end_of_sphere(-nx, -ny, -nz, cx, cy, cz, _vector(rows, HALF_B, g), end_b, dof)
     own = half_of(weight, s, end_a, nx, ny, nz, ax, ay, az, dof)
     other = half_of(-weight, t, end_b, nx, ny, nz, cx, cy, cz, dof)
-    for k in range(len(own)):
-        _put(rows, row + OWN + k, g, own[k])
-        _put(rows, row + OTHER + k, g, other[k])
+    put_turned(rows, _half_at(row + OWN, index(g) * index(WIDTH), dof), own, dof)
+    put_turned(rows, _half_at(row + OTHER, index(g) * index(WIDTH), dof), other, dof)
     given = s, t, end_a, end_b, weight, distance, weight * (distance - touching)
     for k in range(len(given)):
         _put(rows, row + S + k, g, given[k])
@@ -203,8 +216,10 @@ def _part(block, row, k, dof):
     weight = block[row + WEIGHT, k]
     own = half_of(weight, block[row + S, k], end_a, nx, ny, nz, ax, ay, az, dof)
     other = half_of(-weight, block[row + T, k], end_b, nx, ny, nz, cx, cy, cz, dof)
+    flat = shaped(block, (COLUMNS * PAIRS,))
     for c in range(len(own)):
-        block[row + OWN + c, k], block[row + OTHER + c, k] = own[c], other[c]
+        flat[_half_at(row + OWN, k, dof) + index(c)] = own[c]
+        flat[_half_at(row + OTHER, k, dof) + index(c)] = other[c]
 
 
 @lean(inline=True)
@@ -321,7 +336,7 @@ def pair_rows(memory, x, axis, half, radius, scale, found, walls, rows, margin, 
             _put_cells(block, k, i, j, x, axis, half, radius, dof)
             block[S0, k], block[T0, k] = points[start + k, 0], points[start + k, 1]
         vectors = (some.shape[0] + WIDTH - 1) // WIDTH
-        if _put_rows(block.reshape(-1, WIDTH), vectors, margin, dof):
+        if _put_rows(shaped(block, (COLUMNS * VECTORS, WIDTH)), vectors, margin, dof):
             for k in range(some.shape[0]):
                 _part(block, FIRST_ROW, k, dof)
                 _part(block, FIRST_ROW + OF_ROW, k, dof)
@@ -331,17 +346,10 @@ def pair_rows(memory, x, axis, half, radius, scale, found, walls, rows, margin, 
                 if block[HAS + c, k] == 0.0:
                     continue
                 row = FIRST_ROW + c * OF_ROW
-                _put_scaled(H, index(2) * r, block, row + OWN, k, scale, index(i), dof)
-                _put_scaled(H, index(2) * r + index(1), block, row + OTHER, k, scale, index(j), dof)
+                own, other = _half_at(row + OWN, k, dof), _half_at(row + OTHER, k, dof)
+                put_scaled_row(H, index(2) * r, block, own, scale, index(i), dof)
+                put_scaled_row(H, index(2) * r + index(1), block, other, scale, index(j), dof)
                 gaps[r], one[r], two[r] = block[row + WEIGHTED, k], i, j
                 kind[r] = HARD if c < 2 else FAR
                 r += index(1)
     return np.int64(r)
-
-
-@lean(inline=True)
-def _put_scaled(H, h, block, half, k, scale, i, dof):
-    for c in range(degrees(dof)):
-        H[h, c] = block[half + c, k] * scale[i, c]
-    if len(dof) == 8:
-        H[h, 7] = 0.0

@@ -300,3 +300,71 @@ def put_inverse(typing, inverse, i, H, halves, act, first, last, alpha, floor, h
 
     given = inverse, i, H, halves, act, first, last, alpha, floor, held, dof
     return types.float64(*given), emit
+
+
+def _turned(builder, columns):
+    """Rows of 4 or 8 vectors of 8 numbers each: row k has lane k of all of them. As vectors of 8
+    numbers: whole rows, or two rows of 4."""
+    kind = columns[0].type
+
+    def mixed(a, b, *places):
+        return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(INDEX, 8), places))
+
+    quads = []
+    for a, b, c, d in zip(*(columns[k::4] for k in range(4)), strict=True):
+        halves = []
+        for k in (0, 4):  # lanes k … k + 3
+            spread = (k, k + 8, k + 1, k + 9, k + 2, k + 10, k + 3, k + 11)
+            ab, cd = mixed(a, b, *spread), mixed(c, d, *spread)
+            for m in (0, 4):
+                halves.append(mixed(ab, cd, m, m + 1, m + 8, m + 9, m + 2, m + 3, m + 10, m + 11))
+        quads.append(halves)
+    assert kind.count == 8
+    if len(quads) == 1:
+        return quads[0]
+    low, high = (0, 1, 2, 3, 8, 9, 10, 11), (4, 5, 6, 7, 12, 13, 14, 15)
+    return [mixed(a, b, *half) for a, b in zip(*quads, strict=True) for half in (low, high)]
+
+
+@intrinsic
+def put_turned(typing, rows, first, columns, dof):
+    """Of 8 pairs: puts `columns`, a tuple of vectors with a number of each pair, one pair after the
+    other into rows, which are contiguous, from this number on. The last columns of `len(dof)` are
+    0 where there are fewer."""
+    _check(rows)
+
+    def emit(context, builder, signature, given):
+        many = cgutils.unpack_tuple(builder, given[2])
+        out = _Rows(context, builder, signature.args[0], given[0], 8)
+        many += [ir.Constant(many[0].type, [0.0] * 8)] * (len(dof) - len(many))
+        at = builder.gep(out.data, [long_of(context, builder, signature, given, 1)])
+        at = builder.bitcast(at, out.vector.as_pointer())
+        for k, row in enumerate(_turned(builder, many)):
+            place = builder.gep(at, [ir.Constant(INDEX, k)])
+            builder.store(row, place, align=out.bytes)
+        return context.get_dummy_value()
+
+    return types.void(rows, first, columns, dof), emit
+
+
+@intrinsic
+def put_scaled_row(typing, H, h, rows, first, scale, i, dof):
+    """H[h] = `len(dof)` numbers of rows, from this one on, times scale[i], rounded to the type of
+    H."""
+    _check(H)
+    _check(rows, scale)
+
+    def emit(context, builder, signature, given):
+        kinds, width = signature.args, len(dof)
+        out = _Rows(context, builder, kinds[0], given[0], width)
+        numbers = _Rows(context, builder, kinds[2], given[2], width)
+        scales = _Rows(context, builder, kinds[4], given[4], width)
+        at = builder.gep(numbers.data, [long_of(context, builder, signature, given, 3)])
+        at = builder.bitcast(at, numbers.vector.as_pointer())
+        row = builder.load(at, align=numbers.bytes)
+        row = builder.fmul(row, scales.load(long_of(context, builder, signature, given, 5)))
+        row = row if out.vector == row.type else builder.fptrunc(row, out.vector)
+        out.store(long_of(context, builder, signature, given, 1), row)
+        return context.get_dummy_value()
+
+    return types.void(H, h, rows, first, scale, i, dof), emit

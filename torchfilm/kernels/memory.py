@@ -99,10 +99,17 @@ def room(memory, shape, kind):
 def zeros(memory, shape, kind):
     """As `room`, all 0."""
     out = room(memory, shape, kind)
-    flat = out.reshape(-1)
+    flat = shaped(out, (out.size,))
     for k in range(flat.shape[0]):
         flat[k] = 0
     return out
+
+
+@kernel(inline=True)
+def shaped(array, shape):
+    """The numbers of a contiguous array in another shape. Numba's own form is a call, which takes
+    longer than to go through a short array."""
+    return numba.carray(pointer(array.ctypes.data, array), shape)
 
 
 @lean(inline=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from torchfilm.kernels.compiling import index, kernel, lean
 from torchfilm.kernels.lanes import add_scaled, dot, dot_row, put_inverse, put_product
-from torchfilm.kernels.memory import room
+from torchfilm.kernels.memory import room, shaped
 from torchfilm.kernels.rows import degrees
 from torchfilm.kernels.scheme import RAISED, ROUNDING
 
@@ -129,8 +129,8 @@ def go_along(d, g, z, p, inverse, t, first, end, dof):
 @lean
 def next_direction(p, z, t, first, end):
     """p = t p − z, and z = 0."""
-    a, b = first * p.shape[1], end * p.shape[1]
-    p, z = p.reshape(-1)[a:b], z.reshape(-1)[a:b]
+    shape = ((end - first) * p.shape[1],)
+    p, z = shaped(p[first:end], shape), shaped(z[first:end], shape)
     for k in range(p.shape[0]):
         p[k] = t * p[k] - z[k]
         z[k] = 0
@@ -139,8 +139,8 @@ def next_direction(p, z, t, first, end):
 @lean(inline=True)
 def first_direction(d, p, z, first, end):
     """d = 0, p = −z, and z = 0."""
-    a, b = first * p.shape[1], end * p.shape[1]
-    d, p, z = d.reshape(-1)[a:b], p.reshape(-1)[a:b], z.reshape(-1)[a:b]
+    shape = ((end - first) * p.shape[1],)
+    d, p, z = shaped(d[first:end], shape), shaped(p[first:end], shape), shaped(z[first:end], shape)
     for k in range(p.shape[0]):
         d[k], p[k], z[k] = 0, -z[k], 0
 
