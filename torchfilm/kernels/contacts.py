@@ -20,9 +20,9 @@ from torchfilm.kernels.capsules import (
     squared_distance,
     squared_sine,
 )
-from torchfilm.kernels.compiling import index, lean
+from torchfilm.kernels.compiling import index, kernel, lean
 from torchfilm.kernels.lanes import put_scaled_row, put_turned
-from torchfilm.kernels.memory import room, shaped, zeros
+from torchfilm.kernels.memory import room, shaped
 from torchfilm.kernels.rows import FAR, HARD, half_of
 from torchfilm.kernels.scheme import BEYOND
 from torchfilm.kernels.vectors import WIDTH, any_of, load, store, where
@@ -102,26 +102,46 @@ def _measure(rows, vectors, margin, dof):
         _put(rows, NEAR, g, where(near, 1.0, 0.0))
 
 
+@kernel(inline=True)
+def new_block(memory, columns):
+    """A block of so many columns. Those from FIRST_ROW on are written before they are read."""
+    block = room(memory, (columns, PAIRS), np.float64)
+    for column in range(FIRST_ROW):
+        for k in range(PAIRS):
+            block[column, k] = 0.0
+    return block
+
+
 @lean
 def near_contacts(memory, x, axis, half, radius, first, second, margin, dof):
     """The pairs nearer than margin: their number, closest points and gap, µm."""
     m = first.shape[0]
     keep, points = room(memory, (m,), np.int32), room(memory, (m, 2), np.float64)
-    gap = room(memory, (m,), np.float64)
-    block, found = zeros(memory, (FIRST_ROW, PAIRS), np.float64), index(0)
-    for start in range(0, m, PAIRS):
-        count = min(PAIRS, m - start)
+    gap, block = room(memory, (m,), np.float64), new_block(memory, FIRST_ROW)
+    found = near_contacts_of(
+        x, axis, half, radius, first, second, margin, 0, m, keep, points, gap, block, dof
+    )
+    return keep[:found], points[:found], gap[:found]
+
+
+@lean
+def near_contacts_of(x, axis, half, radius, first, second, margin, begin, end, keep, points, gap,
+                     block, dof):  # fmt: skip
+    """Those of the pairs begin … end − 1, from the place `begin` on. block: see
+    `new_block`. Returns how many."""
+    found = index(begin)
+    for start in range(begin, end, PAIRS):
+        count = min(PAIRS, end - start)
         for k in range(count):
             i, j = index(first[start + k]), index(second[start + k])
             _put_cells(block, k, i, j, x, axis, half, radius, dof)
-        _measure(
-            shaped(block, (FIRST_ROW * VECTORS, WIDTH)), (count + WIDTH - 1) // WIDTH, margin, dof
-        )
+        vectors = (count + WIDTH - 1) // WIDTH
+        _measure(shaped(block, (FIRST_ROW * VECTORS, WIDTH)), vectors, margin, dof)
         for k in range(count):  # without branches: their outcome is not foreseen
             keep[found], gap[found] = start + k, block[GAP, k]
             points[found, 0], points[found, 1] = block[S0, k], block[T0, k]
             found += index(block[NEAR, k])
-    return keep[:found], points[:found], gap[:found]
+    return np.int64(found) - begin
 
 
 @lean
@@ -129,18 +149,14 @@ def deepest_of(memory, x, axis, half, radius, found, dof):
     """The least gap of the contacts `found` where cells are now, µm, or 0. found: as in
     `pair_rows`."""
     first, second, keep = found[:3]
-    block, deepest = zeros(memory, (FIRST_ROW, PAIRS), np.float64), 0.0
+    block, deepest = new_block(memory, FIRST_ROW), 0.0
     for start in range(0, keep.shape[0], PAIRS):
         some = keep[start : start + PAIRS]
         for k in range(some.shape[0]):
             i, j = index(first[index(some[k])]), index(second[index(some[k])])
             _put_cells(block, k, i, j, x, axis, half, radius, dof)
-        _measure(
-            shaped(block, (FIRST_ROW * VECTORS, WIDTH)),
-            (some.shape[0] + WIDTH - 1) // WIDTH,
-            0.0,
-            dof,
-        )
+        vectors = (some.shape[0] + WIDTH - 1) // WIDTH
+        _measure(shaped(block, (FIRST_ROW * VECTORS, WIDTH)), vectors, 0.0, dof)
         for k in range(some.shape[0]):
             deepest = min(deepest, block[GAP, k])
     return deepest
@@ -322,15 +338,19 @@ def pair_rows(memory, x, axis, half, radius, scale, found, walls, rows, margin, 
     found: pairs (first, second), and of their contacts the place among these, the closest points
     and the gap, µm: see `near_contacts`.
     """
+    block, m = new_block(memory, COLUMNS), found[2].shape[0]
+    return pair_rows_of(x, axis, half, radius, scale, found, 0, m, walls, rows, margin, block, dof)
+
+
+@lean
+def pair_rows_of(x, axis, half, radius, scale, found, begin, end, place, rows, margin, block, dof):
+    """Those of the contacts begin … end − 1, from this place on. block: as in `near_contacts_of`.
+    Returns the place after them."""
     first, second, keep, points, _ = found
     H, gaps, one, two, kind = rows
-    block, r = room(memory, (COLUMNS, PAIRS), np.float64), index(walls)
-    most = most_rows(dof)
-    for column in range(FIRST_ROW):  # the others are written before they are read
-        for k in range(PAIRS):
-            block[column, k] = 0.0
-    for start in range(0, keep.shape[0], PAIRS):
-        some = keep[start : start + PAIRS]
+    r, most = index(place), most_rows(dof)
+    for start in range(begin, end, PAIRS):
+        some = keep[start : min(start + PAIRS, end)]
         for k in range(some.shape[0]):
             i, j = index(first[index(some[k])]), index(second[index(some[k])])
             _put_cells(block, k, i, j, x, axis, half, radius, dof)

@@ -9,12 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from torchfilm.kernels.compiling import lean
+from torchfilm.kernels.contact_pieces import shared_near_contacts
 from torchfilm.kernels.contacts import deepest_of, near_contacts
 from torchfilm.kernels.memory import room, zeros
 from torchfilm.kernels.moves import approach
 from torchfilm.kernels.neighbours import near_pairs, near_pairs_of
 from torchfilm.kernels.rows import HARD
 from torchfilm.kernels.scheme import HOPS
+from torchfilm.kernels.team import pieces_for
 
 # A search of all pairs takes no longer than one of the pairs of so many of the cells.
 MOST_SOME = 0.3
@@ -69,22 +71,24 @@ def _found_by(memory, numbers, found):
 
 
 @lean
-def found_contacts(memory, x, axis, half, radius, margin, dof):
+def found_contacts(memory, team, x, axis, half, radius, margin, dof):
     """Near pairs (first, second), and the contacts among them: see `near_contacts`."""
     pairs = near_pairs(memory, x, axis, half, radius, margin, dof)
-    return _contacts_among(memory, x, axis, half, radius, margin, pairs, dof)
+    return _contacts_among(memory, team, x, axis, half, radius, margin, pairs, dof)
 
 
 @lean
-def _contacts_among(memory, x, axis, half, radius, margin, pairs, dof):
+def _contacts_among(memory, team, x, axis, half, radius, margin, pairs, dof):
     """The contacts among pairs, which are the first two of `pairs`."""
     first, second = pairs[0], pairs[1]
+    if pieces_for(team, x.shape[0]) > 1:
+        return shared_near_contacts(memory, team, x, axis, half, radius, first, second, margin, dof)
     keep, points, gap = near_contacts(memory, x, axis, half, radius, first, second, margin, dof)
     return first, second, keep, points, gap
 
 
 @lean
-def found_after(memory, x, axis, radius, margin, deep, found, arrays, dof):
+def found_after(memory, team, x, axis, radius, margin, deep, found, arrays, dof):
     """The contacts after a move, and whether one of them is deeper than `deep`. Where none is, they
     may be those before it, `found`. Puts the half lengths after it into the arrays."""
     length, _, half, _, _, _, y, _, _ = arrays
@@ -101,10 +105,10 @@ def found_after(memory, x, axis, radius, margin, deep, found, arrays, dof):
             return found, False
         if count <= MOST_SOME * own.shape[0]:
             pairs = near_pairs_of(memory, x, axis, half, radius, 0.0, some, dof)
-            met = _contacts_among(memory, x, axis, half, radius, 0.0, pairs, dof)
+            met = _contacts_among(memory, team, x, axis, half, radius, 0.0, pairs, dof)
             if _deepest(met[4]) >= -deep:
                 return found, False
-    found = found_contacts(memory, x, axis, half, radius, margin, dof)
+    found = found_contacts(memory, team, x, axis, half, radius, margin, dof)
     return found, _deepest(found[4]) < -deep
 
 

@@ -1,4 +1,4 @@
-"""The loops of the contact solve that a team of threads does piece by piece: see `team`.
+"""The loops over contacts, and of their solve, that a team does piece by piece: see `team`.
 
 They are compiled as functions of their own, of which the board has the address. As a part of the
 step they would be compiled with each function that calls them, which took a minute more.
@@ -13,8 +13,9 @@ import numpy as np
 from numba import types
 
 from torchfilm.kernels.compiling import first_call, native
+from torchfilm.kernels.contact_pieces import NEAR, do_contact_piece
 from torchfilm.kernels.solve_pieces import do_piece
-from torchfilm.kernels.team import DONE, board_at, count_one, take
+from torchfilm.kernels.team import DONE, LOOP, board_at, count_one, take
 
 # A function that is being compiled is compiled once, whichever threads want it.
 _compiling = threading.Lock()
@@ -38,7 +39,10 @@ def _taker(dtype: type, lanes: int):
         like: np.ndarray = np.empty(0, dtype)
         k = take(board, leads)
         while k >= 0:
-            do_piece(board, k, like, dof)
+            if board[LOOP] >= NEAR:
+                do_contact_piece(board, k, like, dof)
+            else:
+                do_piece(board, k, like, dof)
             count += 1
             if not leads:
                 count_one(board, DONE)

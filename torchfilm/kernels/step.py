@@ -23,6 +23,7 @@ from torchfilm.kernels.colonies import (
     taken_out,
 )
 from torchfilm.kernels.compiling import kernel, lean
+from torchfilm.kernels.contact_pieces import shared_pair_rows
 from torchfilm.kernels.contacts import most_rows, pair_rows
 from torchfilm.kernels.found import deep_cells, found_after, found_contacts
 from torchfilm.kernels.memory import TOP, give_back, room, zeros
@@ -45,7 +46,7 @@ from torchfilm.kernels.scheme import (
 )
 from torchfilm.kernels.solve import minimise
 from torchfilm.kernels.solve_parts import overlaps
-from torchfilm.kernels.team import next_of
+from torchfilm.kernels.team import next_of, pieces_for
 
 # Places in the settings. DEEP ≤ 0: TOO_DEEP radii. YIELD: mean overlap
 # of contacts, radii.
@@ -135,16 +136,15 @@ def _minimise_some(
 
 
 @lean
-def _arrays(memory, base, growth, shortest, last, roots):
-    """Lengths after growth, the least that pressure leaves, and their halves, (n,); then arrays for
-    a pass: reach of walls, their weights, α, least scaled Δl, scale, the move, one that is kept,
-    and the move about which a pass is bounded."""
-    n, moves, kind = base.shape[0], last.shape, last.dtype
-    length, least = room(memory, (n,), np.float64), room(memory, (n,), np.float64)
-    half = room(memory, (n,), np.float64)
+def _arrays(memory, length, growth, shortest, last, roots):
+    """Lengths after growth, in place, the least that pressure leaves, and half lengths, (n,); then
+    arrays for a pass: reach of walls, their weights, α, least scaled Δl, scale, the move, one that
+    is kept, and the move about which a pass is bounded."""
+    n, moves, kind = length.shape[0], last.shape, last.dtype
+    least, half = room(memory, (n,), np.float64), room(memory, (n,), np.float64)
     for i in range(n):
-        length[i] = base[i] + growth[i]
-        least[i] = max(base[i] - SHRINK * max(growth[i], 0.0), shortest[i])
+        least[i] = max(length[i] - SHRINK * max(growth[i], 0.0), shortest[i])
+        length[i] += growth[i]
         half[i] = 0.5 * length[i]
     of_walls = room(memory, (n,), np.float64), room(memory, roots.shape, np.float64)
     of_cells = room(memory, (n,), kind), room(memory, (n,), kind)
@@ -170,22 +170,21 @@ def _prepared(memory, x, axis, growth, radius, viscosity, length_drag, last, fir
 
 
 @lean
-def step_colony(memory, x, axis, base, growth, radius, viscosity, length_drag, shortest, last,
+def step_colony(memory, x, axis, length, growth, radius, viscosity, length_drag, shortest, last,
                 hardness, walls, roots, alphas, settings, report, team, dof):  # fmt: skip
-    """Grow one colony by `growth` and part what overlaps; x, axis, base, last, hardness in place.
+    """Grow one colony by `growth` and part what overlaps; x, axis, length, last, hardness in place.
 
-    x, axis (n, d) float64. base: (n,) lengths; to shortest: (n,). last: (n, D) the first move
-    before, from which this one starts. hardness: (1,) α. walls: kinds, places, sizes, which are
-    soft; roots: (S, n) their D, or stiffness · Δt. alphas: (n,), or (0,).
+    x, axis (n, d) float64. length to shortest: (n,). last: (n, D) the move from which to start.
+    hardness: (1,) α. walls: kinds, places, sizes, which are soft; roots: (S, n) their D, or
+    stiffness · Δt. alphas: (n,), or (0,).
     """
-    margin, target, deep, softest, passes = _of_colony(base, growth, radius, viscosity, settings)
-    tolerance, given = settings[TOLERANCE], alphas.shape[0] > 0
+    margin, target, deep, softest, passes = _of_colony(length, growth, radius, viscosity, settings)
+    tolerance, given, is_soft = settings[TOLERANCE], alphas.shape[0] > 0, walls[3]
     hardness[0] = hardness[0] if hardness[0] > 0 else softest
-    arrays = _arrays(memory, base, growth, shortest, last, roots)
-    length, y, kept = arrays[0], arrays[6], arrays[7]
-    is_soft, far = walls[3], margin * (settings[SOFT] <= 0)
+    arrays = _arrays(memory, length, growth, shortest, last, roots)
+    half, y, kept = arrays[2], arrays[6], arrays[7]
     number, deeply, softer, rising, held, kept_alpha = 0, False, 1.0, True, 0.0, 0.0
-    found = found_contacts(memory, x, axis, arrays[2], radius, margin, dof)
+    found = found_contacts(memory, team, x, axis, half, radius, margin, dof)
     report[DEEPLY] = 0 if settings[SOFT] > 0 else deeply_overlapping(memory, found, radius)
     top = memory[1][TOP]
     while number < passes:
@@ -197,11 +196,12 @@ def step_colony(memory, x, axis, base, growth, radius, viscosity, length_drag, s
         if number > 0 and not deeply:  # cells do not lie deep in others; but in a wall?
             if deepest >= -deep:
                 break
-            found, deeply = found_contacts(memory, x, axis, arrays[2], radius, margin, dof), True
+            found = found_contacts(memory, team, x, axis, half, radius, margin, dof)
+            deeply = True
             top = memory[1][TOP]
             continue
         error, e, m = _solved(
-            memory, x, axis, radius, found, rows, at_walls, deep, far, number > 0, arrays,
+            memory, x, axis, radius, found, rows, at_walls, deep, margin, number > 0, arrays,
             2 * target, settings, report, team, dof,
         )  # fmt: skip
         failed = error > tolerance and error < np.inf
@@ -210,8 +210,7 @@ def step_colony(memory, x, axis, base, growth, radius, viscosity, length_drag, s
             continue
         if softer > 1.0 and not failed:  # back towards the α that is wanted
             put(y, kept)
-            held, kept_alpha = error, hardness[0] * softer
-            softer, rising = softer / SOFTER, False
+            held, kept_alpha, softer, rising = error, hardness[0] * softer, softer / SOFTER, False
             continue
         if failed and not rising and not given:
             put(kept, y)
@@ -231,17 +230,12 @@ def step_colony(memory, x, axis, base, growth, radius, viscosity, length_drag, s
         number, softer, rising = number + 1, 1.0, True
         if number < passes:
             give_back(memory, top)
-            found, deeply = found_after(memory, x, axis, radius, margin, deep, found, arrays, dof)
+            found, deeply = found_after(
+                memory, team, x, axis, radius, margin, deep, found, arrays, dof
+            )
             top = memory[1][TOP]
         if not deeply and is_soft.shape[0] == 0:
             break
-    _put_lengths(length, base)
-
-
-@lean
-def _put_lengths(length, base):
-    for i in range(base.shape[0]):
-        base[i] = length[i]
 
 
 @lean
@@ -259,13 +253,19 @@ def _carried_out(x, axis, last, pushed, margin, first_pass, arrays, dof):
 
 
 @lean
-def _solved(memory, x, axis, radius, found, rows, walls, deep, far, some, arrays, cap, settings,
+def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, some, arrays, cap, settings,
             report, team, dof):  # fmt: skip
     """Solve a pass, of which `walls` rows are made: for all cells, or for `some`, those that lie
     deep. Returns the error, each row's gap after the move, and how many rows there are."""
     _, _, half, _, (alpha, low), scale, y, _, _ = arrays
+    far = margin * (settings[SOFT] <= 0)
     numbers, count, mine = deep_cells(memory, found, rows, walls, deep, len(y) * some)
-    m = pair_rows(memory, x, axis, half, radius, scale, mine, walls, rows, far, dof)
+    if pieces_for(team, x.shape[0]) > 1:
+        m = shared_pair_rows(
+            memory, team, x, axis, half, radius, scale, mine, walls, rows, far, dof
+        )
+    else:
+        m = pair_rows(memory, x, axis, half, radius, scale, mine, walls, rows, far, dof)
     error, e = _minimise_some(
         memory, rows, m, numbers, count, alpha, low, y, cap, settings, report, team, dof
     )
@@ -305,9 +305,9 @@ def _following(e, soft, hardness, target, softest):
     not count: they push little, and would make the mean of the others larger."""
     total, count = 0.0, 0
     for r in range(e.shape[0]):
-        if e[r] < 0 and soft[r] == HARD:
-            total -= e[r]
-            count += 1
+        pushes = (e[r] < 0) & (soft[r] == HARD)
+        total -= e[r] if pushes else 0.0  # without branches: their outcome is not foreseen
+        count += pushes
     wanted = softest
     if count:
         force = total / count / hardness

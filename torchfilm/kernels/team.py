@@ -34,7 +34,7 @@ PIECES_A_THREAD = 2
 # and what is done of it; then which loop it is, threads, pieces and by what they are done, and the
 # cells from which a solve is shared; then what pieces need.
 OFFER, DONE, LOOP, THREADS, PIECES, TAKER, LEAST, NUMBERS = 0, 16, 32, 33, 34, 35, 36, 37
-WORDS = 80
+WORDS = 112
 # What stands in the place of an offer when there will be no more.
 OVER = -1
 # An offer: the first piece that nobody has, and one more than the last, in 16 bits each. A thread
