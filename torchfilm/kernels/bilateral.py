@@ -254,7 +254,9 @@ def step_colonies(memory, taken, which, begin, dt, longest, cells, drags, alphas
                 own_alpha = (PENALTY / drag).astype(own_alpha.dtype)
             overlap, tolerance = _asked(settings, own_alpha * drag, own_radius, steps > 1)
             passes = int(settings[COARSE_PASSES] if steps > 1 else settings[MOST_PASSES])
+            top = memory[1][TOP]
             for _ in range(steps):
+                give_back(memory, top)
                 length = step_colony(
                     memory, own_x, own_axis, length, share, own_radius, viscosity, drag, own_alpha,
                     start, last, overlap, kinds, places[:, b], sizes[:, b], roots, is_soft, passes,

@@ -2,18 +2,18 @@
 
 The arguments of both kinds of contacts:
 
-taken: (1,) int64, how many of `which` threads have taken. which: (K,) int64, the colonies to step,
-each by the thread that takes it. begin: (B + 1,) int64; cells of colony b are begin[b] …
-begin[b + 1] − 1. dt: h. longest: µm that a cell may grow in a sub-step. cells: position (N, d)
-float64, axis (N, d), length (N,) after growth, elongation (N,), radius (N,), the last move (N, D),
-collapsed steps (N,) int64, α of the last step (N,) and compression (N,), or (0,) of bilateral
-contacts. drags: viscosity and length drag, (N,) or (1,) for all cells, and the factor `drag`, (N,)
-or (0,). alphas: how α is given (NOT_GIVEN, GIVEN or OF_STIFFNESS), and values, (N,), (1,) or (0,).
-walls: kinds (S,), places (S, B, 3), sizes (S, B), weight or stiffness of each cell (S, N), and
-which are soft (S,). settings: float64, in the order of `physics.compiled._kernel_of`. out: arrays
-for what the cells become: position, axis, length, move, elongation, collapsed steps, α,
-compression. reports: (B, REPORT). dof: a tuple as long as there are columns D: 4 in the plane, 8 in
-space, where the last one stays 0.
+memory: the store and marks of `kernels.memory`. taken: (1,) int64, how many of `which` threads have
+taken. which: (K,) int64, the colonies to step, each by the thread that takes it. begin: (B + 1,)
+int64; cells of colony b are begin[b] … begin[b + 1] − 1. dt: h. longest: µm that a cell may grow in
+a sub-step. cells: position (N, d) float64, axis (N, d), length (N,) after growth, elongation (N,),
+radius (N,), the last move (N, D), collapsed steps (N,) int64, α of the last step (N,) and
+compression (N,), or (0,) of bilateral contacts. drags: viscosity and length drag, (N,) or (1,) for
+all cells, and the factor `drag`, (N,) or (0,). alphas: how α is given (NOT_GIVEN, GIVEN or
+OF_STIFFNESS), and values, (N,), (1,) or (0,). walls: kinds (S,), places (S, B, 3), sizes (S, B),
+weight or stiffness of each cell (S, N), and which are soft (S,). settings: float64, in the order of
+`physics.compiled._kernel_of`. out: arrays for what the cells become: position, axis, length, move,
+elongation, collapsed steps, α, compression. reports: (B, REPORT). dof: a tuple as long as there are
+columns D: 4 in the plane, 8 in space, where the last one stays 0.
 """
 
 from __future__ import annotations

@@ -34,7 +34,8 @@ config: Any = numba.config
 def _digest() -> str:
     """A name for this version of the kernels, at this place: Numba looks at the file of a function
     only, not at the functions that it calls."""
-    found = hashlib.sha256(f"{numba.__version__} {Path(__file__).parent}".encode())
+    tested = "TORCHFILM_OVERWRITES_MEMORY" in os.environ  # see `memory`
+    found = hashlib.sha256(f"{numba.__version__} {Path(__file__).parent} {tested}".encode())
     for file in sorted(Path(__file__).parent.glob("*.py")):
         found.update(file.read_bytes())
     return found.hexdigest()[:16]
@@ -228,9 +229,10 @@ def kernel(
     their order, unless any_order: then the compiler may choose one, the same for all calls with as
     many terms. Such a function must not write to arrays: the order would depend on how near to each
     other they lie in memory. inline: compile it into its callers; a call with many arrays costs
-    more than the work of a short function. borrows: it makes no arrays, and none of those that it
-    is given is freed meanwhile; so it need not count who uses them, which took a tenth of the time
-    of small colonies. It must not give an array back to one that counts.
+    more than the work of a short function. borrows: it makes no arrays but by
+    `memory.room`, and none of those that it is given is freed meanwhile; so it need not count who
+    uses them, which took a tenth of the time of small colonies. It must not return an array that it
+    was given to a kernel that counts.
     """
     if function is None:
         return partial(kernel, entry=entry, any_order=any_order, inline=inline, borrows=borrows)

@@ -9,11 +9,18 @@ from __future__ import annotations
 import numpy as np
 
 from torchfilm.kernels.compiling import kernel, lean
-from torchfilm.kernels.contacts import COLUMNS, PAIRS, most_rows, near_contacts_of, pair_rows_of
+from torchfilm.kernels.contacts import (
+    COLUMNS,
+    PAIRS,
+    clear_block,
+    most_rows,
+    near_contacts_of,
+    pair_rows_of,
+)
 from torchfilm.kernels.lanes import copy_row
-from torchfilm.kernels.memory import room, zeros
+from torchfilm.kernels.memory import room
 from torchfilm.kernels.solve_pieces import BOX
-from torchfilm.kernels.team import LOOP, PIECES, array_at, pieces_for, share_out
+from torchfilm.kernels.team import LEAST, LOOP, PIECES, array_at, pieces_for, share_out
 
 # The loops, after those of the solve: contacts of near pairs, and rows of contacts.
 NEAR, MAKE_ROWS = 8, 9
@@ -27,20 +34,28 @@ CELLS, NEAR_PAIRS, CONTACTS, WALLS, ROOM = range(BOX + 1, BOX + 6)
 
 
 @lean
+def shares(board, cells, many):
+    """Whether a team shares work on so many pairs or contacts of a colony."""
+    return pieces_for(board, cells) > 1 and many >= board[LEAST] // 4
+
+
+@lean
 def _put_cells_on_board(memory, board, x, axis, half, radius, margin):
-    """Tell the team where the cells are. Returns arrays that all pieces need: blocks, what each
-    finds, and the margin."""
+    """Tell the team where the cells are. Returns where each piece puts how much it finds: a tuple
+    with one array."""
     pieces = pieces_for(board, x.shape[0])
     board[PIECES], board[CELLS] = pieces, x.shape[0]
     board[X], board[AXIS] = x.ctypes.data, axis.ctypes.data
     board[HALF], board[RADIUS] = half.ctypes.data, radius.ctypes.data
-    blocks = zeros(memory, (pieces * COLUMNS, PAIRS), np.float64)
+    blocks = room(memory, (pieces * COLUMNS, PAIRS), np.float64)
+    for k in range(pieces):
+        clear_block(blocks[k * COLUMNS :])
     found, box = room(memory, (pieces,), np.int64), room(memory, (1,), np.float64)
     box[0] = margin
     board[BLOCKS], board[FOUND], board[MARGIN] = (
         blocks.ctypes.data, found.ctypes.data, box.ctypes.data,
     )  # fmt: skip
-    return blocks, found, box
+    return (found,)
 
 
 @lean
@@ -58,7 +73,7 @@ def shared_near_contacts(memory, board, x, axis, half, radius, first, second, ma
     m = first.shape[0]
     keep, points = room(memory, (m,), np.int32), room(memory, (m, 2), np.float64)
     gap = room(memory, (m,), np.float64)
-    _, found, _ = _put_cells_on_board(memory, board, x, axis, half, radius, margin)
+    (found,) = _put_cells_on_board(memory, board, x, axis, half, radius, margin)
     _put_contacts_on_board(board, (first, second, keep, points, gap))
     share_out(board, NEAR)
     new = found[0]
@@ -77,7 +92,7 @@ def shared_pair_rows(memory, board, x, axis, half, radius, scale, contacts, wall
     """As `pair_rows`."""
     most, m = most_rows(dof), contacts[2].shape[0]
     h, gaps, one, two, kind = rows
-    _, found, _ = _put_cells_on_board(memory, board, x, axis, half, radius, margin)
+    (found,) = _put_cells_on_board(memory, board, x, axis, half, radius, margin)
     _put_contacts_on_board(board, contacts)
     board[WALLS], board[ROOM], board[SCALE] = walls, gaps.shape[0], scale.ctypes.data
     board[H], board[GAPS], board[KIND] = h.ctypes.data, gaps.ctypes.data, kind.ctypes.data

@@ -106,10 +106,15 @@ def _measure(rows, vectors, margin, dof):
 def new_block(memory, columns):
     """A block of so many columns. Those from FIRST_ROW on are written before they are read."""
     block = room(memory, (columns, PAIRS), np.float64)
+    clear_block(block)
+    return block
+
+
+@lean(inline=True)
+def clear_block(block):
     for column in range(FIRST_ROW):
         for k in range(PAIRS):
             block[column, k] = 0.0
-    return block
 
 
 @lean

@@ -9,14 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from torchfilm.kernels.compiling import lean
-from torchfilm.kernels.contact_pieces import shared_near_contacts
+from torchfilm.kernels.contact_pieces import shared_near_contacts, shares
 from torchfilm.kernels.contacts import deepest_of, near_contacts
 from torchfilm.kernels.memory import room, zeros
 from torchfilm.kernels.moves import approach
 from torchfilm.kernels.neighbours import near_pairs, near_pairs_of
 from torchfilm.kernels.rows import HARD
 from torchfilm.kernels.scheme import HOPS
-from torchfilm.kernels.team import pieces_for
 
 # A search of all pairs takes no longer than one of the pairs of so many of the cells.
 MOST_SOME = 0.3
@@ -81,7 +80,7 @@ def found_contacts(memory, team, x, axis, half, radius, margin, dof):
 def _contacts_among(memory, team, x, axis, half, radius, margin, pairs, dof):
     """The contacts among pairs, which are the first two of `pairs`."""
     first, second = pairs[0], pairs[1]
-    if pieces_for(team, x.shape[0]) > 1:
+    if shares(team, x.shape[0], first.shape[0]):
         return shared_near_contacts(memory, team, x, axis, half, radius, first, second, margin, dof)
     keep, points, gap = near_contacts(memory, x, axis, half, radius, first, second, margin, dof)
     return first, second, keep, points, gap

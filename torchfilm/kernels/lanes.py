@@ -303,9 +303,9 @@ def put_inverse(typing, inverse, i, H, halves, act, first, last, alpha, floor, h
 
 
 def _turned(builder, columns):
-    """Rows of 4 or 8 vectors of 8 numbers each: row k has lane k of all of them. As vectors of 8
-    numbers: whole rows, or two rows of 4."""
-    kind = columns[0].type
+    """Rows of 4 or 8 vectors of 8 numbers each, as `vectors.WIDTH`: row k has lane k of all of
+    them. As vectors of 8 numbers: whole rows, or two rows of 4."""
+    assert columns[0].type.count == 8
 
     def mixed(a, b, *places):
         return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(INDEX, 8), places))
@@ -319,7 +319,6 @@ def _turned(builder, columns):
             for m in (0, 4):
                 halves.append(mixed(ab, cd, m, m + 1, m + 8, m + 9, m + 2, m + 3, m + 10, m + 11))
         quads.append(halves)
-    assert kind.count == 8
     if len(quads) == 1:
         return quads[0]
     low, high = (0, 1, 2, 3, 8, 9, 10, 11), (4, 5, 6, 7, 12, 13, 14, 15)

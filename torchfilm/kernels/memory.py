@@ -3,13 +3,14 @@
 A large array that is freed goes back to the system, and comes again page by page: each is cleared
 by the system and entered in its tables, 1 µs for 4 KB. In colonies of 25,000 cells this took a
 quarter of a step. So arrays lie one after the other in `store`, which stays; a kernel gives back
-all that it took since some place at once, by `give_back`. What finds no room is allocated until the
-call ends; before the next call the store is made as large as it would have had to be. So kernels
-need not count who uses an array, as Numba does.
+all that it took since some place at once, by `give_back`. What finds no room is allocated until it
+is given back; before the next call the store is made as large as it would have had to be. So `lean`
+kernels need not count who uses an array, as Numba does.
 """
 
 from __future__ import annotations
 
+import os
 import threading
 from typing import Any
 
@@ -21,13 +22,17 @@ from torchfilm.kernels.compiling import kernel, lean
 from torchfilm.kernels.lanes import intrinsic
 
 # Places in `marks`: bytes in use, and the most that were; with those that found no room. Then the
-# address of what was allocated last, where that of what was allocated before stands.
+# address of what was allocated last; there stand that of what was allocated before, and the bytes
+# that were in use.
 TOP, MOST, LAST = range(3)
 MARKS = 3
 # Arrays begin at multiples of so many bytes: lines of the processor's memory.
 LINE = 64
-# A store is made smaller when it is so many bytes, and four times, larger than was needed.
-ROOMY = 1 << 22
+# A store is made smaller when it is so many bytes, and four times, larger than was needed; what
+# was needed is forgotten by this share a call, since large and small colonies may take turns.
+ROOMY, FORGOTTEN = 1 << 22, 0.02
+# For tests: what is given back is overwritten, so that who reads it all the same is found out.
+OVERWRITES = "TORCHFILM_OVERWRITES_MEMORY" in os.environ
 
 
 @intrinsic
@@ -57,8 +62,8 @@ _free: Any = types.ExternalFunction("NRT_Free", types.void(types.uintp))
 
 
 @kernel(inline=True)
-def _word_at(address):
-    return numba.carray(pointer(address, np.int64), (1,))
+def _words_at(address):
+    return numba.carray(pointer(address, np.int64), (2,))
 
 
 @lean
@@ -71,18 +76,30 @@ def _place(memory, size):
     if marks[TOP] <= store.shape[0]:
         return np.int64(store.ctypes.data) + begin
     address = np.int64(_allocate(np.uintp(size + 2 * LINE)))
-    _word_at(address)[0] = marks[LAST]
+    if address == 0:
+        raise MemoryError("no memory for the contacts of a colony")
+    words = _words_at(address)
+    words[0], words[1] = marks[LAST], begin
     marks[LAST] = address
     return (address + 2 * LINE - 1) // LINE * LINE
 
 
-@kernel(entry=True)
-def free_rest(marks):
-    """Free what was allocated because it found no room."""
+@lean
+def _free_since(marks, top):
+    """Free what was allocated since so many bytes were in use."""
     while marks[LAST] != 0:
         address = marks[LAST]
-        marks[LAST] = _word_at(address)[0]
+        words = _words_at(address)
+        if words[1] < top:
+            return
+        marks[LAST] = words[0]
         _free(np.uintp(address))
+
+
+@kernel(entry=True)
+def free_all(marks):
+    """Free all that was allocated because it found no room."""
+    _free_since(marks, 0)
 
 
 @kernel(inline=True)
@@ -107,15 +124,21 @@ def zeros(memory, shape, kind):
 
 @kernel(inline=True)
 def shaped(array, shape):
-    """The numbers of a contiguous array in another shape. Numba's own form is a call, which takes
-    longer than to go through a short array."""
+    """The numbers of an array in another shape; it must be contiguous. Numba's own form is a call,
+    which takes longer than to go through a short array."""
     return numba.carray(pointer(array.ctypes.data, array), shape)
 
 
 @lean(inline=True)
 def give_back(memory, top):
     """All arrays taken since `marks[TOP]` was this."""
-    memory[1][TOP] = top
+    store, marks = memory
+    if OVERWRITES:
+        for k in range(min(top, store.shape[0]), min(marks[TOP], store.shape[0])):
+            store[k] = 255
+    if marks[LAST] != 0:
+        _free_since(marks, top)
+    marks[TOP] = top
 
 
 def no_memory() -> tuple[np.ndarray, np.ndarray]:
@@ -132,10 +155,12 @@ def new_store(size: int) -> np.ndarray:
 
 
 class KeptMemory(threading.local):
-    """A store and its marks, of each thread that calls kernels."""
+    """A store and its marks, of each thread that calls kernels. It stays until smaller colonies
+    are stepped, or the thread ends."""
 
     def __init__(self) -> None:
         self.store, self.marks = no_memory()
+        self.needed = 0.0  # bytes, by the calls of late
 
     def call(self, function, *given: object) -> None:
         """function((store, marks), *given); then fit the store to what was needed."""
@@ -143,11 +168,15 @@ class KeptMemory(threading.local):
             function((self.store, self.marks), *given)
         finally:
             if self.marks[LAST] != 0:
-                free_rest(self.marks)
+                free_all(self.marks)
         most, size = int(self.marks[MOST]), self.store.size
-        if most > size or 4 * most + ROOMY < size:
-            self.store = new_store(most + most // 4)
         self.marks[MOST] = 0
+        self.needed = max(most, self.needed * (1 - FORGOTTEN))
+        if most > size or 4 * self.needed + ROOMY < size:
+            try:
+                self.store = new_store(most + most // 4)
+            except MemoryError:  # the step itself has found room
+                return
 
 
 kept = KeptMemory()

@@ -161,11 +161,6 @@ def _conjugate_gradients(H, one, two, on, alpha, inverse, g, z, p, d, gz, limit,
 
 
 @lean(inline=True)
-def _hold(work):
-    """Arrays whose addresses a team has must not be freed before this."""
-
-
-@lean(inline=True)
 def _put_gaps(H, one, two, e, q, v, pushed, act, stale, y, t, team, dof):
     """The gaps after the move y, and the rows' forces."""
     t[0] = 1.0
@@ -333,5 +328,4 @@ def minimise(
     if pieces > 1:
         put_on_board(team, work, n, rows)
     total, error = _rounds(work, tolerance, cap, limit, team, dof)
-    _hold(work)
     return total, error, work[3]

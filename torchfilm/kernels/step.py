@@ -23,7 +23,7 @@ from torchfilm.kernels.colonies import (
     taken_out,
 )
 from torchfilm.kernels.compiling import kernel, lean
-from torchfilm.kernels.contact_pieces import shared_pair_rows
+from torchfilm.kernels.contact_pieces import shared_pair_rows, shares
 from torchfilm.kernels.contacts import most_rows, pair_rows
 from torchfilm.kernels.found import deep_cells, found_after, found_contacts
 from torchfilm.kernels.memory import TOP, give_back, room, zeros
@@ -46,7 +46,7 @@ from torchfilm.kernels.scheme import (
 )
 from torchfilm.kernels.solve import minimise
 from torchfilm.kernels.solve_parts import overlaps
-from torchfilm.kernels.team import next_of, pieces_for
+from torchfilm.kernels.team import next_of
 
 # Places in the settings. DEEP ≤ 0: TOO_DEEP radii. YIELD: mean overlap
 # of contacts, radii.
@@ -260,7 +260,7 @@ def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, some, arr
     _, _, half, _, (alpha, low), scale, y, _, _ = arrays
     far = margin * (settings[SOFT] <= 0)
     numbers, count, mine = deep_cells(memory, found, rows, walls, deep, len(y) * some)
-    if pieces_for(team, x.shape[0]) > 1:
+    if shares(team, x.shape[0], mine[2].shape[0]):
         m = shared_pair_rows(
             memory, team, x, axis, half, radius, scale, mine, walls, rows, far, dof
         )

@@ -32,7 +32,7 @@ BLOCK = 64
 PIECES_A_THREAD = 2
 # Places on the board, of which those that threads write at the same time are far apart: the offer
 # and what is done of it; then which loop it is, threads, pieces and by what they are done, and the
-# cells from which a solve is shared; then what pieces need.
+# cells from which a colony is shared; then what pieces need.
 OFFER, DONE, LOOP, THREADS, PIECES, TAKER, LEAST, NUMBERS = 0, 16, 32, 33, 34, 35, 36, 37
 WORDS = 112
 # What stands in the place of an offer when there will be no more.
@@ -135,7 +135,7 @@ def board_at(address):
 
 
 def new_board(threads: int, least: int, taker: int) -> np.ndarray:
-    """A board for so many threads, which share solves of `least` cells or more. taker: the address
+    """A board for so many threads, which share colonies of `least` cells. taker: the address
     of what they do pieces by."""
     board = np.zeros(WORDS, np.int64)
     board[THREADS], board[LEAST], board[TAKER] = threads, least, taker
