@@ -229,10 +229,10 @@ def kernel(
     their order, unless any_order: then the compiler may choose one, the same for all calls with as
     many terms. Such a function must not write to arrays: the order would depend on how near to each
     other they lie in memory. inline: compile it into its callers; a call with many arrays costs
-    more than the work of a short function. borrows: it makes no arrays but by
-    `memory.room`, and none of those that it is given is freed meanwhile; so it need not count who
-    uses them, which took a tenth of the time of small colonies. It must not return an array that it
-    was given to a kernel that counts.
+    more than the work of a short function. borrows: it makes no arrays but by `memory.room`, and
+    none of those that it is given is freed meanwhile; so it need not count who uses them, which
+    took a tenth of the time of small colonies. It must not return an array that it was given to a
+    kernel that counts.
     """
     if function is None:
         return partial(kernel, entry=entry, any_order=any_order, inline=inline, borrows=borrows)
