@@ -26,10 +26,17 @@ from torchfilm.kernels.colonies import (
 )
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.contacts import near_contacts, pair_rows
-from torchfilm.kernels.memory import TOP, give_back, room
+from torchfilm.kernels.memory import TOP, give_back
 from torchfilm.kernels.moves import drags
 from torchfilm.kernels.neighbours import near_pairs, spatial_order
-from torchfilm.kernels.rows import STIFF, deeply_overlapping, degrees, rows_among, wall_rows
+from torchfilm.kernels.rows import (
+    STIFF,
+    deeply_overlapping,
+    degrees,
+    room_for_rows,
+    rows_among,
+    wall_rows,
+)
 from torchfilm.kernels.scheme import NOT_FINITE
 from torchfilm.kernels.team import next_of
 
@@ -102,9 +109,7 @@ def _wall_contacts(memory, x, axis, half, radius, scale, alpha, kinds, places, s
     Marks in `left` the cells that lie too deep in a wall."""
     n, number = x.shape[0], 0
     most = 2 * found[2].shape[0] + 3 * kinds.shape[0] * n
-    H, gaps = room(memory, (2 * most, len(dof)), like.dtype), room(memory, (most,), like.dtype)
-    one, two = room(memory, (most,), np.int32), room(memory, (most,), np.int32)
-    soft = room(memory, (most,), np.uint8)
+    H, gaps, one, two, soft = room_for_rows(memory, most, like, dof)
     for w in range(kinds.shape[0]):
         root = np.sqrt(roots[w] * alpha) if is_soft[w] else roots[w].copy()
         reach = NEAR * radius * (hold and not is_soft[w])
@@ -236,6 +241,7 @@ def step_colonies(memory, taken, which, begin, dt, longest, cells, drags, alphas
     soft, limit, x, radius = settings[SOFT] > 0, int(settings[LIMIT]), cells[0], cells[4]
     kinds, places, sizes, _, is_soft = walls
     while True:
+        give_back(memory, 0)
         b = next_of(which, taken)
         if b < 0:
             return
@@ -244,7 +250,6 @@ def step_colonies(memory, taken, which, begin, dt, longest, cells, drags, alphas
             continue
         if opened(first, end, longest, cells, drags, out, report):
             steps = int(report[SUBSTEPS])
-            give_back(memory, 0)
             of = spatial_order(memory, x[first:end], 6.0 * radius[first]) + first
             own_x, own_axis, start, roots, length, share, own_radius, viscosity, drag = taken_out(
                 memory, of, steps, dt / steps, cells, drags, walls, dof

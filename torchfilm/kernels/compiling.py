@@ -30,12 +30,15 @@ from numba.core.typed_passes import NativeLowering
 
 config: Any = numba.config
 
+# For tests: `memory.give_back` overwrites what is given back, so that who reads it all the same is
+# found out.
+OVERWRITES = "TORCHFILM_OVERWRITES_MEMORY" in os.environ
+
 
 def _digest() -> str:
     """A name for this version of the kernels, at this place: Numba looks at the file of a function
     only, not at the functions that it calls."""
-    tested = "TORCHFILM_OVERWRITES_MEMORY" in os.environ  # see `memory`
-    found = hashlib.sha256(f"{numba.__version__} {Path(__file__).parent} {tested}".encode())
+    found = hashlib.sha256(f"{numba.__version__} {Path(__file__).parent} {OVERWRITES}".encode())
     for file in sorted(Path(__file__).parent.glob("*.py")):
         found.update(file.read_bytes())
     return found.hexdigest()[:16]
@@ -232,7 +235,8 @@ def kernel(
     more than the work of a short function. borrows: it makes no arrays but by `memory.room`, and
     none of those that it is given is freed meanwhile; so it need not count who uses them, which
     took a tenth of the time of small colonies. It must not return an array that it was given to a
-    kernel that counts.
+    kernel that counts; and Numba lets it return a new one in a tuple only, so what returns a single
+    array counts.
     """
     if function is None:
         return partial(kernel, entry=entry, any_order=any_order, inline=inline, borrows=borrows)

@@ -16,6 +16,7 @@ from torchfilm.kernels.contacts import (
     most_rows,
     near_contacts_of,
     pair_rows_of,
+    room_for_contacts,
 )
 from torchfilm.kernels.lanes import copy_row
 from torchfilm.kernels.memory import room
@@ -39,10 +40,9 @@ def shares(board, cells, many):
     return pieces_for(board, cells) > 1 and many >= board[LEAST] // 4
 
 
-@lean
+@kernel
 def _put_cells_on_board(memory, board, x, axis, half, radius, margin):
-    """Tell the team where the cells are. Returns where each piece puts how much it finds: a tuple
-    with one array."""
+    """Tell the team where the cells are. Returns where each piece puts how much it finds."""
     pieces = pieces_for(board, x.shape[0])
     board[PIECES], board[CELLS] = pieces, x.shape[0]
     board[X], board[AXIS] = x.ctypes.data, axis.ctypes.data
@@ -55,7 +55,7 @@ def _put_cells_on_board(memory, board, x, axis, half, radius, margin):
     board[BLOCKS], board[FOUND], board[MARGIN] = (
         blocks.ctypes.data, found.ctypes.data, box.ctypes.data,
     )  # fmt: skip
-    return (found,)
+    return found
 
 
 @lean
@@ -71,9 +71,8 @@ def _put_contacts_on_board(board, found):
 def shared_near_contacts(memory, board, x, axis, half, radius, first, second, margin, dof):
     """The pairs (first, second), and their contacts as `near_contacts` finds them."""
     m = first.shape[0]
-    keep, points = room(memory, (m,), np.int32), room(memory, (m, 2), np.float64)
-    gap = room(memory, (m,), np.float64)
-    (found,) = _put_cells_on_board(memory, board, x, axis, half, radius, margin)
+    keep, points, gap = room_for_contacts(memory, m)
+    found = _put_cells_on_board(memory, board, x, axis, half, radius, margin)
     _put_contacts_on_board(board, (first, second, keep, points, gap))
     share_out(board, NEAR)
     new = found[0]
@@ -92,7 +91,7 @@ def shared_pair_rows(memory, board, x, axis, half, radius, scale, contacts, wall
     """As `pair_rows`."""
     most, m = most_rows(dof), contacts[2].shape[0]
     h, gaps, one, two, kind = rows
-    (found,) = _put_cells_on_board(memory, board, x, axis, half, radius, margin)
+    found = _put_cells_on_board(memory, board, x, axis, half, radius, margin)
     _put_contacts_on_board(board, contacts)
     board[WALLS], board[ROOM], board[SCALE] = walls, gaps.shape[0], scale.ctypes.data
     board[H], board[GAPS], board[KIND] = h.ctypes.data, gaps.ctypes.data, kind.ctypes.data

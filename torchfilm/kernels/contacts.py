@@ -118,11 +118,18 @@ def clear_block(block):
 
 
 @lean
+def room_for_contacts(memory, most):
+    """Arrays for so many contacts: their places among the pairs, closest points and gaps."""
+    keep, points = room(memory, (most,), np.int32), room(memory, (most, 2), np.float64)
+    return keep, points, room(memory, (most,), np.float64)
+
+
+@lean
 def near_contacts(memory, x, axis, half, radius, first, second, margin, dof):
     """The pairs nearer than margin: their number, closest points and gap, µm."""
     m = first.shape[0]
-    keep, points = room(memory, (m,), np.int32), room(memory, (m, 2), np.float64)
-    gap, block = room(memory, (m,), np.float64), new_block(memory, FIRST_ROW)
+    keep, points, gap = room_for_contacts(memory, m)
+    block = new_block(memory, FIRST_ROW)
     found = near_contacts_of(
         x, axis, half, radius, first, second, margin, 0, m, keep, points, gap, block, dof
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from torchfilm.kernels.compiling import lean
 from torchfilm.kernels.contact_pieces import shared_near_contacts, shares
-from torchfilm.kernels.contacts import deepest_of, near_contacts
+from torchfilm.kernels.contacts import deepest_of, near_contacts, room_for_contacts
 from torchfilm.kernels.memory import room, zeros
 from torchfilm.kernels.moves import approach
 from torchfilm.kernels.neighbours import near_pairs, near_pairs_of
@@ -58,10 +58,7 @@ def _found_by(memory, numbers, found):
     """The contacts `found` of numbered cells."""
     first, second, keep, points, gap = found
     m, new = keep.shape[0], 0
-    some = (
-        room(memory, (m,), np.int32), room(memory, (m, 2), np.float64),
-        room(memory, (m,), np.float64),
-    )  # fmt: skip
+    some = room_for_contacts(memory, m)
     for k in range(m):
         some[0][new], some[2][new] = keep[k], gap[k]
         some[1][new, 0], some[1][new, 1] = points[k, 0], points[k, 1]

@@ -10,7 +10,6 @@ kernels need not count who uses an array, as Numba does.
 
 from __future__ import annotations
 
-import os
 import threading
 from typing import Any
 
@@ -18,7 +17,7 @@ import numba
 import numpy as np
 from numba import types
 
-from torchfilm.kernels.compiling import kernel, lean
+from torchfilm.kernels.compiling import OVERWRITES, kernel, lean
 from torchfilm.kernels.lanes import intrinsic
 
 # Places in `marks`: bytes in use, and the most that were; with those that found no room. Then the
@@ -31,8 +30,6 @@ LINE = 64
 # A store is made smaller when it is so many bytes, and four times, larger than was needed; what
 # was needed is forgotten by this share a call, since large and small colonies may take turns.
 ROOMY, FORGOTTEN = 1 << 22, 0.02
-# For tests: what is given back is overwritten, so that who reads it all the same is found out.
-OVERWRITES = "TORCHFILM_OVERWRITES_MEMORY" in os.environ
 
 
 @intrinsic
@@ -119,6 +116,15 @@ def zeros(memory, shape, kind):
     flat = shaped(out, (out.size,))
     for k in range(flat.shape[0]):
         flat[k] = 0
+    return out
+
+
+@kernel
+def copied(memory, array, count):
+    """The first `count` numbers of an array."""
+    out = room(memory, (count,), array.dtype)
+    for k in range(count):
+        out[k] = array[k]
     return out
 
 

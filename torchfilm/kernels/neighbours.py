@@ -8,7 +8,7 @@ import numpy as np
 
 from torchfilm.kernels.compiling import index, kernel, lean
 from torchfilm.kernels.lanes import boxes_meet, copy_row
-from torchfilm.kernels.memory import room, zeros
+from torchfilm.kernels.memory import copied, room, zeros
 
 # By how much boxes are enlarged, of their distance from the colony's corner: as single numbers they
 # are rounded by less.
@@ -75,9 +75,7 @@ def _fill_table(memory, low, high, top, used, boxes, dof):
             members = begin[slots]
             member, key = room(memory, (members,), np.int32), room(memory, (members,), np.int64)
             box = room(memory, (members, len(dof)), np.float32)
-            fill = room(memory, (slots,), np.int64)
-            for s in range(slots):
-                fill[s] = begin[s]
+            fill = copied(memory, begin, slots)
         for i in range(n):
             z0, z1 = (low[i, 2], high[i, 2]) if d == 3 else (np.int64(0), np.int64(0))
             for bz in range(z0, z1 + 1):

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from torchfilm.kernels.compiling import index, lean
-from torchfilm.kernels.memory import room, zeros
+from torchfilm.kernels.memory import copied, room, zeros
 
 FLAT, INSIDE, OUTSIDE = 0, 1, 2
 # Rows: of rigid contacts, of walls with a stiffness and with a weight below 1, and of two cells at
@@ -153,6 +153,14 @@ def rows_among(H, gaps, one, two, soft, rows, number):
 
 
 @lean
+def room_for_rows(memory, most, like, dof):
+    """Arrays for so many rows: H, gaps of the type of `like`, one, two, and their kinds."""
+    H, gaps = room(memory, (2 * most, len(dof)), like.dtype), room(memory, (most,), like.dtype)
+    one, two = room(memory, (most,), np.int32), room(memory, (most,), np.int32)
+    return H, gaps, one, two, room(memory, (most,), np.uint8)
+
+
+@lean
 def rows_of_cells(memory, one, two, rows, n):
     """The halves of each cell, in the order of rows: where each cell's begin, and the halves."""
     begin = zeros(memory, (n + 1,), np.int64)
@@ -162,9 +170,7 @@ def rows_of_cells(memory, one, two, rows, n):
             begin[index(two[r]) + index(1)] += 1
     for i in range(n):
         begin[i + 1] += begin[i]
-    half, fill = room(memory, (begin[n],), np.int32), room(memory, (n,), np.int64)
-    for i in range(n):
-        fill[i] = begin[i]
+    half, fill = room(memory, (begin[n],), np.int32), copied(memory, begin, n)
     for r in range(rows):
         i = index(one[r])
         half[index(fill[i])] = 2 * r

@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from torchfilm.kernels.compiling import kernel, lean
-from torchfilm.kernels.memory import room, zeros
+from torchfilm.kernels.memory import copied, room, zeros
 from torchfilm.kernels.rows import degrees, rows_of_cells
 from torchfilm.kernels.scheme import CREEP, FORCING, LEVEL, MOST_LOOKS, MOST_ROUNDS
 from torchfilm.kernels.solve_parts import (
@@ -239,7 +239,7 @@ def _work(memory, H, one, two, rows, gaps, pushed, alpha, low, y, pieces, dof):
         stale[i] = 1
     of_rows, of_cells, moves = (rows,), (n,), (n, len(dof))
     return (
-        H, one, two, _copied(memory, gaps, rows), room(memory, of_rows, kind),
+        H, one, two, copied(memory, gaps, rows), room(memory, of_rows, kind),
         room(memory, of_rows, kind), pushed, zeros(memory, of_rows, np.uint8), stale, alpha, low, y,
         room(memory, moves, kind), room(memory, moves, kind), room(memory, moves, kind),
         room(memory, moves, kind), room(memory, (n, len(dof), len(dof)), kind),
@@ -248,14 +248,6 @@ def _work(memory, H, one, two, rows, gaps, pushed, alpha, low, y, pieces, dof):
         room(memory, (max(rows, mine.shape[0]),), np.int32), zeros(memory, (pieces,), np.int64),
         room(memory, (3, (n + BLOCK - 1) // BLOCK), np.float64), room(memory, (1,), kind),
     )  # fmt: skip
-
-
-@kernel
-def _copied(memory, gaps, rows):
-    out = room(memory, (rows,), gaps.dtype)
-    for r in range(rows):
-        out[r] = gaps[r]
-    return out
 
 
 @lean
@@ -321,7 +313,7 @@ def minimise(
     n = y.shape[0]
     if not overlaps(gaps, rows):  # nothing pushes: such a colony does not move at all
         y[:] = 0
-        return 0, 0.0, _copied(memory, gaps, rows)
+        return 0, 0.0, copied(memory, gaps, rows)
     pieces = pieces_for(team, n)
     team = team[: 0 if pieces == 1 else team.shape[0]]
     work = _work(memory, H, one, two, rows, gaps, pushed, alpha, low, y, pieces, dof)

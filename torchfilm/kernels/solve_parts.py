@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from torchfilm.kernels.compiling import index, kernel, lean
 from torchfilm.kernels.lanes import add_scaled, dot, dot_row, put_inverse, put_product
-from torchfilm.kernels.memory import room, shaped
+from torchfilm.kernels.memory import copied, shaped
 from torchfilm.kernels.rows import degrees
 from torchfilm.kernels.scheme import RAISED, ROUNDING
 
@@ -235,9 +235,8 @@ def keep_pushing(act, rows, on):
 def second_cells(memory, H, one, two, rows):
     """The second cell of each row; the first where there is no second, whose half of the row is
     made 0. So all rows are alike."""
-    other = room(memory, (rows,), two.dtype)
+    other = copied(memory, two, rows)
     for r in range(rows):
-        other[r] = two[r]
         if two[r] < 0:
             other[r] = one[r]
             H[2 * r + 1] = 0.0

@@ -6,7 +6,7 @@ import numpy as np
 
 from torchfilm.kernels import solve_parts as parts
 from torchfilm.kernels.compiling import kernel, lean
-from torchfilm.kernels.memory import room, zeros
+from torchfilm.kernels.memory import copied, room, zeros
 from torchfilm.kernels.team import BLOCK, LOOP, NUMBERS, PIECES, array_at, range_of
 
 # The loops: gaps after the first move, what the rows' forces ask of the cells, a product of CG, a
@@ -38,9 +38,7 @@ def rows_of_pieces(memory, one, two, rows, n, pieces):
         begin[b + 1] += a != b
     for k in range(pieces):
         begin[k + 1] += begin[k]
-    fill, mine = room(memory, (pieces,), np.int64), room(memory, (begin[pieces],), np.int32)
-    for k in range(pieces):
-        fill[k] = begin[k]
+    fill, mine = copied(memory, begin, pieces), room(memory, (begin[pieces],), np.int32)
     for r in range(rows):
         a, b = owner[one[r] // BLOCK], owner[two[r] // BLOCK]
         mine[fill[a]] = r

@@ -29,7 +29,15 @@ from torchfilm.kernels.found import deep_cells, found_after, found_contacts
 from torchfilm.kernels.memory import TOP, give_back, room, zeros
 from torchfilm.kernels.moves import drags, move_cells
 from torchfilm.kernels.neighbours import spatial_order
-from torchfilm.kernels.rows import HARD, STIFF, deeply_overlapping, degrees, rows_among, wall_rows
+from torchfilm.kernels.rows import (
+    HARD,
+    STIFF,
+    deeply_overlapping,
+    degrees,
+    room_for_rows,
+    rows_among,
+    wall_rows,
+)
 from torchfilm.kernels.scheme import (
     DEEP_IN_SUBSTEPS,
     HARDEST,
@@ -60,9 +68,7 @@ def _wall_contacts(memory, x, axis, half, radius, scale, at, found, like, dof):
     which are soft, and weight and reach by cell."""
     (kinds, places, sizes, is_soft), root, reach = at
     most = most_rows(dof) * found[4].shape[0] + 3 * kinds.shape[0] * x.shape[0]
-    H, gaps = room(memory, (2 * most, len(dof)), like.dtype), room(memory, (most,), like.dtype)
-    one, two = room(memory, (most,), np.int32), room(memory, (most,), np.int32)
-    rows = H, gaps, one, two, room(memory, (most,), np.uint8)
+    rows = room_for_rows(memory, most, like, dof)
     walls, deepest = wall_rows(
         x, axis, half, radius, scale, kinds, places, sizes, root, reach, rows, is_soft, False, dof,
     )  # fmt: skip
@@ -324,6 +330,7 @@ def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, 
     x, radius, contact_alpha = cells[0], cells[4], cells[7]
     kinds, places, sizes, _, is_soft = walls
     while True:
+        give_back(memory, 0)
         b = next_of(which, taken)
         if b < 0:
             return
@@ -333,7 +340,6 @@ def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, 
         hardness = np.array([contact_alpha[first:end].max()], np.float64)
         if opened(first, end, longest, cells, drags, out, report):
             steps = int(report[SUBSTEPS])
-            give_back(memory, 0)
             of = spatial_order(memory, x[first:end], 6.0 * radius[first])
             for i in range(end - first):
                 of[i] += first
