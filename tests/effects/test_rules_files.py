@@ -131,6 +131,27 @@ def test_a_file_that_is_gone_for_a_moment_is_no_error(rules_file):
     assert run(model, state, 1).growth_rate.tolist() == [2.0, 2.0]
 
 
+def test_a_file_that_is_still_being_written_is_left_until_it_is_whole(rules_file, monkeypatch):
+    """Whether the rest comes with a later time of edit, or within the same tick of the clock."""
+    source, model = watched(rules_file)
+    state = run(model, model.start(), 1)
+    for later in (0, 10**9):
+        rules_file.write_text("")
+        stamp = rules_file.stat().st_mtime_ns
+
+        def finish(_, stamp=stamp + later):
+            rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
+            os.utime(rules_file, ns=(stamp, stamp))
+
+        monkeypatch.setattr("torchfilm.tools.hot_reload.time.sleep", finish)
+        state = run(model, state, 1)
+        assert not source.messages
+        state = run(model, state, 1)
+        assert state.growth_rate.tolist() == [2.0, 2.0]
+        assert [message.split()[-1] for message in source.messages] == ["reloaded"]
+        source.messages.clear()
+
+
 def test_an_edit_that_breaks_only_later_does_not_end_the_run(rules_file):
     """It passes when it is taken up and fails two steps after: the last good rules must carry
     on."""

@@ -23,7 +23,7 @@ from torchfilm.effects.bound_rules import MEANING, BoundRules, DivisionRule
 from torchfilm.rule_views import CellsView, DivisionView
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
-from torchfilm.tools.hot_reload import HotReload, load_functions
+from torchfilm.tools.hot_reload import HotReload, edited, load_functions
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Rules(Effect):
     writes_anything = True
 
     def __post_init__(self) -> None:
-        path, stamp = None, 0
+        path, stamp = None, (0, 0)
         functions: dict[str, Any] = {"update": self.update, "divide": self.divide}
         if isinstance(self.update, (str, Path)):
             # the path as given, else in a folder of sys.path, such as that of the scene file
@@ -60,7 +60,7 @@ class Rules(Effect):
                     "a function or the path of a Python file",
                     "No such file.",
                 )
-            stamp = path.stat().st_mtime_ns
+            stamp = edited(path)
             functions = load_functions(path, ("update", "divide"))
         for name, given in functions.items():
             if given is not None and not callable(given):

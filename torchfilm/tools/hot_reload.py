@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,6 +16,8 @@ from torchfilm.tools.load_module import run_file
 Functions = dict[str, Callable[..., None] | None]
 T = TypeVar("T")
 
+SETTLED = 0.05  # s: an edit is loaded once the file has not changed for this long
+
 
 def load_functions(path: Path, names: tuple[str, ...]) -> Functions:
     """Run a user's Python file and return its functions with the given names.
@@ -26,6 +29,12 @@ def load_functions(path: Path, names: tuple[str, ...]) -> Functions:
     if not any(map(callable, found.values())):
         raise checks.InputError(f"{path} defines neither {' nor '.join(names)}.")
     return found
+
+
+def edited(path: Path) -> tuple[int, int]:
+    """Time of a file's last edit, ns, and its size, bytes."""
+    found = path.stat()
+    return found.st_mtime_ns, found.st_size
 
 
 def unchanged(now: Tensor, then: Tensor) -> bool:
@@ -41,11 +50,10 @@ class HotReload:
 
     While `watching` is set, `refresh` loads an edited file. `messages` reports a broken edit, when
     it fails to load or when it first fails; the previous functions stay in use. Messages give the
-    simulated time of the last `refresh`. stamp: time of the file's last edit, ns, as its functions
-    were loaded.
+    simulated time of the last `refresh`. stamp: `edited` of the file as its functions were loaded.
     """
 
-    def __init__(self, path: Path | None, functions: Functions, stamp: int = 0):
+    def __init__(self, path: Path | None, functions: Functions, stamp: tuple[int, int] = (0, 0)):
         self.path, self.functions = path, functions
         self.watching = False
         self.messages: list[str] = []
@@ -64,17 +72,24 @@ class HotReload:
         """Whether the last good functions take the place of those in use, should these fail."""
         return self.watching and self._previous is not None
 
-    def refresh(self, time: float) -> None:
-        """Load the file again if it was edited. time: simulated, h."""
-        self._time = time
+    def refresh(self, now: float) -> None:
+        """Load the file again if it was edited. now: simulated time, h.
+
+        An editor empties the file before it writes the new text: one that is still changing is left
+        for the next call.
+        """
+        self._time = now
         if not self.watching or self.path is None:
             return
         try:
-            stamp = self.path.stat().st_mtime_ns
+            stamp = edited(self.path)
+            if stamp == self._stamp:
+                return
+            time.sleep(SETTLED)
+            if stamp != edited(self.path):
+                return
         except OSError:
             return  # an editor is replacing the file at this moment
-        if stamp == self._stamp:
-            return
         self._stamp = stamp
         try:
             functions = load_functions(self.path, tuple(self.functions))
