@@ -207,6 +207,20 @@ def test_growth_without_a_rate_is_warned_of_unless_something_sets_it():
     quiet(tf.scenes.nutrient_limited)
 
 
+def test_division_without_a_threshold_is_warned_of_unless_something_sets_the_flag():
+    def rule(cells):
+        cells.divide_flag = cells.length > 3.5
+
+    effects = tf.Growth(rate=1.0), tf.Division(), tf.Mechanics(dim=2)
+    scene = tf.Scene(*effects)
+    with pytest.warns(UserWarning, match=r"no threshold.*no cell will divide.*length=tf\.Uniform"):
+        model = scene.bind()
+    with pytest.raises(tf.InputError, match=r"divide_flag.*to 4 cells.*length=tf\.Uniform.*until"):
+        tf.simulate(model, cells=4)
+    quiet(lambda: tf.simulate(tf.Scene(tf.Rules(rule), *effects), cells=4))
+    quiet(lambda: tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics()).bind())
+
+
 def test_a_rate_per_minute_is_warned_of():
     with pytest.warns(UserWarning, match=r"0\.035 per hour.*20 h.*multiplied by 60 \(2\.1\)"):
         tf.Scene(tf.Growth(rate=0.035), tf.Mechanics(dim=2)).bind()

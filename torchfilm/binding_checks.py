@@ -55,9 +55,9 @@ def check_end(effects: Sequence[BoundEffect], state: State, cells: int) -> None:
     effect waits for a field that is 0 everywhere in a colony and that nothing sets, or nothing adds
     cells. Warn if a run can end only with colonies that have lost all cells."""
     for effect in effects:
-        for name in effect.effect.waits_for():
+        for name, needs in effect.effect.waits_for().items():
             if not _sets(effects, name, effect):
-                _check_moves(effect, name, state, cells)
+                _check_moves(effect, name, needs, state, cells)
     short = (state.counts > 0) & (state.counts < cells)
     if bool(short.any()) and (why := _why_none_divides(effects)):
         raise checks.InputError(
@@ -118,9 +118,9 @@ def _sets(effects: Sequence[BoundEffect], name: str, effect: BoundEffect) -> boo
     return any(e.effect.writes_anything or name in e.writes() or is_own(e.effect) for e in others)
 
 
-def _check_moves(effect: BoundEffect, name: str, state: State, cells: int) -> None:
+def _check_moves(effect: BoundEffect, name: str, needs: str, state: State, cells: int) -> None:
     """Raise InputError if a colony that is to have more cells rests: a field that `effect` waits
-    for is 0 in all its cells, and none is due to divide."""
+    for is 0 in all its cells, and none is due to divide. needs: what to give the effect."""
     moves = state.fields[name] != 0
     if "divide_flag" in state.fields:
         moves = moves | (state.fields["divide_flag"] != 0)
@@ -132,8 +132,8 @@ def _check_moves(effect: BoundEffect, name: str, state: State, cells: int) -> No
             f"{effect.title} waits for {name!r}, which is"
             f" 0{'' if len(ids) == state.colonies else some} and which nothing in this"
             f" scene sets: no run would come to {cells} cells. Give"
-            f" {type(effect.effect).__name__} a parameter above 0 (such as rate=1.0),"
-            " or a rule that sets it; or end the run by a time, until=…"
+            f" {type(effect.effect).__name__} {needs}, or a rule that sets it; or end the run by a"
+            " time, until=…"
         )
 
 

@@ -153,9 +153,10 @@ class Effect(metaclass=checks.KnownKeywords):
         """Names of what `step` changes."""
         return ()
 
-    def waits_for(self) -> Sequence[str]:
-        """Fields that must not be 0 everywhere in a colony if it is to have more cells."""
-        return ()
+    def waits_for(self) -> Mapping[str, str]:
+        """Fields that must not be 0 everywhere in a colony if it is to have more cells; with what
+        to give this effect then."""
+        return {}
 
     def idle_without(self, state: State) -> Mapping[str, str]:
         """Fields without whose change by another effect this one, or a part of it, does nothing

@@ -31,7 +31,8 @@ from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, phy
 
 CRITERIA = ("length", "volume", "added")
 TOO_SHORT = 1
-PIXELS = 10.0  # µm; for a longer first cell, messages say that lengths may be in pixels
+PIXELS = 10.0  # µm; of a longer first cell, messages say that lengths may be in pixels
+THRESHOLD = "a threshold (such as length=tf.Uniform(3.5, 4.5))"  # what it needs without rules
 
 
 @dataclass(frozen=True)
@@ -158,17 +159,23 @@ class Division(Effect):
     def writes(self) -> tuple[str, ...]:
         return ("cells", "position", "axis", "length", "divide_flag")
 
+    def waits_for(self) -> Mapping[str, str]:
+        return {} if self.divides_at_threshold else {"divide_flag": THRESHOLD}
+
+    def idle_without(self, state: State) -> Mapping[str, str]:
+        if self.divides_at_threshold or bool(state.fields["divide_flag"].any()):
+            return {}
+        no = "Division() has no threshold, and nothing here sets divide_flag: no cell will divide."
+        return {"divide_flag": f"{no} Give it {THRESHOLD}, or a rule that sets the flag."}
+
     def check(self, state: State, values: Values) -> None:
         if self.criterion is None or state.cells == 0:
             return
         # cells from a micrograph may exceed the threshold drawn for them, and divide in the first
         # step; no cell may exceed every threshold that can be drawn
         least, most = self._bounds(state)
-        start = {
-            "length": state.length,
-            "volume": state.volume,
-            "added": torch.zeros_like(state.length),
-        }[self.criterion]
+        added = torch.zeros_like(state.length)
+        start = {"length": state.length, "volume": state.volume, "added": added}[self.criterion]
         below = torch.nonzero(start >= most).squeeze(1)
         if below.numel():
             k = int(below[0])

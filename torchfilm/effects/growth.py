@@ -4,7 +4,7 @@ back."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -93,8 +93,8 @@ class Growth(Effect):
     def reads(self) -> tuple[str, ...]:
         return ("growth_rate", "length", "radius")
 
-    def waits_for(self) -> tuple[str, ...]:
-        return ("growth_rate",)
+    def waits_for(self) -> Mapping[str, str]:
+        return {"growth_rate": "a parameter above 0 (such as rate=1.0)"}
 
     def writes(self) -> tuple[str, ...]:
         return ("length", "elongation", *(("growth_rate",) if self.by_type else ()))
