@@ -255,7 +255,12 @@ def main() -> None:
     parser.add_argument(
         "--case", action="append", choices=sorted(CASES), help="one case; may be repeated"
     )
-    parser.add_argument("--regime", choices=sorted(REGIMES), help="default: free, pressed")
+    parser.add_argument(
+        "--regime",
+        action="append",
+        choices=sorted(REGIMES),
+        help="default: free, pressed; may be repeated",
+    )
     parser.add_argument("--backend", choices=("compiled", "torch"))
     parser.add_argument("--quick", action="store_true", help="small sizes only")
     parser.add_argument("--device", default="cpu")
@@ -282,7 +287,7 @@ def main() -> None:
         print(records[-1])
     for name in options.case or (QUICK if options.quick else USUAL):
         dim, _, _ = CASES[name]
-        for regime in [options.regime] if options.regime else USUAL_REGIMES:
+        for regime in options.regime or USUAL_REGIMES:
             # compile, and load what the first steps load
             warm = scene(dim, regime, options.backend).bind(device=options.device)
             list(tf.simulate(warm.scene, warm.start(), cells=8))

@@ -18,7 +18,15 @@ import numpy as np
 from torchfilm.kernels.compiling import kernel, lean
 from torchfilm.kernels.memory import copied, room, zeros
 from torchfilm.kernels.rows import degrees, rows_of_cells
-from torchfilm.kernels.scheme import CREEP, FORCING, LEVEL, MOST_LOOKS, MOST_ROUNDS
+from torchfilm.kernels.scheme import (
+    CREEP,
+    EASY_ROUNDS,
+    FORCING,
+    FORCING_LATE,
+    LEVEL,
+    MOST_LOOKS,
+    MOST_ROUNDS,
+)
 from torchfilm.kernels.solve_parts import (
     add_curvature,
     add_forces,
@@ -140,8 +148,10 @@ def _shared_cg_step(team, rz, t):
 
 
 @lean
-def _conjugate_gradients(H, one, two, on, alpha, inverse, g, z, p, d, gz, limit, t, team, dof):
-    """d = −(JᵀAJ + α)⁻¹ g, to FORCING of the residual, from `first_direction`; g becomes the
+def _conjugate_gradients(
+    H, one, two, on, alpha, inverse, g, z, p, d, gz, share, limit, t, team, dof
+):
+    """d = −(JᵀAJ + α)⁻¹ g, to a share of the residual, from `first_direction`; g becomes the
     residual. t: (1,). Returns iterations."""
     rz, count = gz, 0
     while count < limit and rz > 0:
@@ -150,7 +160,7 @@ def _conjugate_gradients(H, one, two, on, alpha, inverse, g, z, p, d, gz, limit,
         else:
             new = cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof)
         count += 1
-        if not (new > FORCING * FORCING * gz and new < np.inf):
+        if not (new > share * share * gz and new < np.inf):
             break
         t[0], rz = new / rz, new
         if team.shape[0]:
@@ -282,9 +292,10 @@ def _rounds(work, tolerance, cap, limit, team, dof):
         done = error <= tolerance or not left < np.inf or stuck > 1
         if done or total >= limit or round_ == MOST_ROUNDS:
             break
+        forcing = FORCING if round_ < EASY_ROUNDS else FORCING_LATE
         total += _conjugate_gradients(
-            H, one, two, on[: counts[0]], alpha, inverse, g, z, p, d, gz, limit - total, t, team,
-            dof,
+            H, one, two, on[: counts[0]], alpha, inverse, g, z, p, d, gz, forcing, limit - total, t,
+            team, dof,
         )  # fmt: skip
         most, c0, c1 = _bounded(
             H, one, two, q, alpha, low, y, d, slope, own, lengths, team, dof

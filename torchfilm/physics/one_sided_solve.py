@@ -13,7 +13,9 @@ from torch import Tensor
 
 from torchfilm.kernels.scheme import (
     CREEP,
+    EASY_ROUNDS,
     FORCING,
+    FORCING_LATE,
     LEVEL,
     MOST_LOOKS,
     MOST_ROUNDS,
@@ -83,10 +85,11 @@ def minimise(
     at = _look(problem, here, cap)
     going = at.goes_on(tolerance) & (limit > 0)
     goes_on = bool(going.any())
-    for _ in range(MOST_ROUNDS):
+    for round_ in range(MOST_ROUNDS):
         if not goes_on:
             break
-        target = torch.where(going, FORCING**2 * at.residual, torch.inf)
+        forcing = FORCING if round_ < EASY_ROUNDS else FORCING_LATE
+        target = torch.where(going, forcing**2 * at.residual, torch.inf)
         result = conjugate_gradients(
             problem.system(at.active),
             -at.gradient,
