@@ -23,7 +23,9 @@ def folder(tmp_path_factory):
     """A folder with the masks and fluorescence of three colonies at their end, and their state."""
     path = tmp_path_factory.mktemp("micrographs")
     scene = grown(tf.LogNormal(1.5, 0.2), 1.0, 1.0, tf.Mechanics(dim=2))
-    for state in tf.simulate(scene, until=2.5, colonies=3, seed=3, record=path / "run.h5"):
+    ends = lambda seed: list(tf.simulate(scene, until=2.5, colonies=3, seed=seed))[-1]
+    seed = next(seed for seed in range(3, 20) if not near_edges(ends(seed)))
+    for state in tf.simulate(scene, until=2.5, colonies=3, seed=seed, record=path / "run.h5"):
         end = state
     with tf.Results(path / "run.h5") as results:
         for k in range(3):
@@ -34,6 +36,15 @@ def folder(tmp_path_factory):
                 **view,
             )  # fmt: skip
     return path, end
+
+
+def near_edges(state: tf.State) -> bool:
+    """Whether a cell lies so near to the edge of a ring that it would change sides in an image,
+    where places are to a tenth of a pixel."""
+    centre = state.groups.sum(state.position) / state.counts.unsqueeze(1)
+    radius = (state.position - centre.index_select(0, state.colony)).norm(dim=1, keepdim=True)
+    edges = radius.new_tensor(Observed.from_state(state, species=["gfp"]).plan.edges[1:])
+    return bool(((radius - edges).abs() < 0.1 * PIXEL).any())
 
 
 def images(path) -> tuple[list, dict[str, list]]:
@@ -54,8 +65,8 @@ def test_images_give_the_statistics_of_the_colonies_that_they_show(folder):
     assert (found.colonies, found.cells, found.time) == (3, state.cells, 2.5)
     one, other = of_names(wanted), of_names(found)
     assert one.keys() == other.keys() and one["log_cells"] == other["log_cells"]
-    # masks give lengths to 0.4 pixels and places to a tenth of one; no cell lies so near to the
-    # edge of a ring that it changes sides
+    # masks give lengths to 0.4 pixels and places to a tenth of one; no cell changes
+    # the side of an edge of a ring: see `near_edges`
     exact = {"length": 0.4 * PIXEL, "gyration": 0.1 * PIXEL, "density": 1e-9, "alignment": 0.005}
     for name, value in one.items():
         group = name.split("_")[0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -267,6 +269,18 @@ def test_a_solve_cut_short_says_so():
     x, report = solve_contacts(p.problem(), None, 1e-12, 3)
     assert int(report.status[0]) == ITERATION_LIMIT and float(report.residual[0]) > 1e-12
     assert bool(torch.isfinite(x).all())
+
+
+@PATHS
+@pytest.mark.parametrize("scale", [1e-15, 1e-18, 1e-20, 1e-22, 1e-30, 1e-42])
+def test_forces_too_small_for_float32_end_a_solve(scale, path):
+    """Their squares, and with them curvatures, round to 0."""
+    p = Problem.random(3, [12, 2], 4)
+    p = replace(p, gap=scale * p.gap)
+    kind = np.float32 if path == "compiled" else torch.float32
+    y, error, iterations = pushed(p, path, 1e-4, 500, dtype=kind)
+    assert np.isfinite(y).all() and np.isfinite(error).all() and np.abs(y).max() <= 10 * scale
+    assert (iterations <= 500).all()
 
 
 @PATHS

@@ -53,7 +53,7 @@ class Mechanics(Effect):
     a smaller Δt converges to the motion of soft cells.
 
     passes: at most this many a step; later ones move only the cells deeper than `overlap`, µm, and,
-    if contacts are one-sided, those near them (default 0.2 radii, 8 passes, 1 for soft cells;
+    if contacts are one-sided, those near them (default 0.2 radii, 24 passes, 1 for soft cells;
     bilateral: 0.2 radii or less, 1 pass in the plane and 2 in space, 6 with sub-steps). tolerance:
     of a solve. One-sided: relative error of the contact forces, default 0.07. Bilateral: worst
     residual relative to that at rest, default 0.05 or, where α γ is below 0.1, 0.05 · (α γ/0.1)^¼.

@@ -89,7 +89,7 @@ def _conjugate_gradients(H, one, two, on, alpha, inverse, g, z, p, d, target, li
         new = cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof)
         count += 1
         worst = _worst(z, dof)
-        if not (worst > target and worst < np.inf and new > 0):
+        if not (worst > target and worst < np.inf and new > 0 and t[0] > 0):
             break
         t[0], rz = new / rz, new
         next_direction(p, z, t[0], 0, z.shape[0])

@@ -15,15 +15,14 @@ from torchfilm.kernels.memory import room, zeros
 from torchfilm.kernels.moves import approach
 from torchfilm.kernels.neighbours import near_pairs, near_pairs_of
 from torchfilm.kernels.rows import HARD
-from torchfilm.kernels.scheme import HOPS
 
 # A search of all pairs takes no longer than one of the pairs of so many of the cells.
 MOST_SOME = 0.3
 
 
 @lean
-def deep_cells(memory, found, rows, walls, deep, n):
-    """Numbers of those of n cells that lie deeper than `deep` in others, of those up to HOPS
+def deep_cells(memory, found, rows, walls, deep, n, hops):
+    """Numbers of those of n cells that lie deeper than `deep` in others, of those up to `hops`
     contacts away, and of those so deep in a hard wall; −1 for the others; how many; and their
     contacts, as others make no row that counts. n is 0: all contacts."""
     first, second, keep, _, gap = found
@@ -34,7 +33,7 @@ def deep_cells(memory, found, rows, walls, deep, n):
     for k in range(keep.shape[0]):
         if gap[k] < -deep:
             mark[first[keep[k]]] = mark[second[keep[k]]] = 1
-    for hop in range(1, HOPS + 1):
+    for hop in range(1, hops + 1):
         for k in range(keep.shape[0]):
             i, j = first[keep[k]], second[keep[k]]
             if gap[k] < 0.1 * deep:

@@ -21,6 +21,7 @@ from torchfilm.kernels.rows import degrees, rows_of_cells
 from torchfilm.kernels.scheme import (
     CREEP,
     EASY_ROUNDS,
+    FLAT,
     FORCING,
     FORCING_LATE,
     LEVEL,
@@ -125,6 +126,13 @@ def _work_of(pushed, q):
 
 
 @lean
+def _share(rz, curvature):
+    """How far to go along a direction; 0 where rounding leaves no curvature, as at the end of a
+    solve that is nearly exact."""
+    return rz / curvature if curvature > FLAT * rz else 0.0
+
+
+@lean
 def cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof):
     """Go along the direction p: d += t p, and g becomes the gradient there and z = P⁻¹ g. z is 0
     before; rz: g · P⁻¹ g before. Returns g · z."""
@@ -132,7 +140,7 @@ def cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof):
     add_product(H, one, two, on, p, z, dof)
     for a in range(0, n, BLOCK):
         curvature += add_curvature(alpha, z, p, a, min(a + BLOCK, n), dof)
-    t[0] = rz / curvature
+    t[0] = _share(rz, curvature)
     for a in range(0, n, BLOCK):
         new += go_along(d, g, z, p, inverse, t[0], a, min(a + BLOCK, n), dof)
     return new
@@ -142,7 +150,7 @@ def cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof):
 def _shared_cg_step(team, rz, t):
     """As `cg_step`, by a team."""
     share_out(team, PRODUCT)
-    t[0] = rz / total_of(team, 0)
+    t[0] = _share(rz, total_of(team, 0))
     share_out(team, ALONG)
     return total_of(team, 0)
 
@@ -160,7 +168,7 @@ def _conjugate_gradients(
         else:
             new = cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof)
         count += 1
-        if not (new > share * share * gz and new < np.inf):
+        if not (new > share * share * gz and new < np.inf) or t[0] == 0:
             break
         t[0], rz = new / rz, new
         if team.shape[0]:

@@ -41,6 +41,7 @@ from torchfilm.kernels.rows import (
 from torchfilm.kernels.scheme import (
     DEEP_IN_SUBSTEPS,
     HARDEST,
+    HOPS,
     ITERATION_LIMIT,
     LAG,
     MARGIN,
@@ -207,7 +208,7 @@ def step_colony(memory, x, axis, length, growth, radius, viscosity, length_drag,
             top = memory[1][TOP]
             continue
         error, e, m = _solved(
-            memory, x, axis, radius, found, rows, at_walls, deep, margin, number > 0, arrays,
+            memory, x, axis, radius, found, rows, at_walls, deep, margin, number, arrays,
             2 * target, settings, report, team, dof,
         )  # fmt: skip
         failed = error > tolerance and error < np.inf
@@ -259,13 +260,14 @@ def _carried_out(x, axis, last, pushed, margin, first_pass, arrays, dof):
 
 
 @lean
-def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, some, arrays, cap, settings,
-            report, team, dof):  # fmt: skip
-    """Solve a pass, of which `walls` rows are made: for all cells, or for `some`, those that lie
-    deep. Returns the error, each row's gap after the move, and how many rows there are."""
+def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, number, arrays, cap,
+            settings, report, team, dof):  # fmt: skip
+    """Solve a pass, of which `walls` rows are made: the first for all cells, a later one for those
+    that lie deep and those near them. Returns the error, each row's gap after the move, and how many rows there are."""
     _, _, half, _, (alpha, low), scale, y, _, _ = arrays
     far = margin * (settings[SOFT] <= 0)
-    numbers, count, mine = deep_cells(memory, found, rows, walls, deep, len(y) * some)
+    some, hops = len(y) * (number > 0), HOPS * number
+    numbers, count, mine = deep_cells(memory, found, rows, walls, deep, some, hops)
     if shares(team, x.shape[0], mine[2].shape[0]):
         m = shared_pair_rows(
             memory, team, x, axis, half, radius, scale, mine, walls, rows, far, dof

@@ -91,7 +91,7 @@ class _OneStep:
             if number == 0 and not given.settings.soft:
                 at = replace(at, deeply_overlapping=self._deeply(pairs, gap, active, at))
             if number > 0:
-                moving = self._deep_cells(pairs, gap, walls)
+                moving = self._deep_cells(pairs, gap, walls, HOPS * number)
                 active = active & self.groups.any(moving)
                 of_active = active.index_select(0, self.groups.owner)
                 moving = moving & of_active
@@ -142,15 +142,15 @@ class _OneStep:
         found = self.groups.sum(mark.to(gap.dtype).unsqueeze(1)).squeeze(1).long()
         return torch.where(active, found, at.deeply_overlapping)
 
-    def _deep_cells(self, pairs, gap: Tensor, walls: WallContacts) -> Tensor:
-        """The cells deep in others or in a hard wall, and those up to HOPS contacts from the
+    def _deep_cells(self, pairs, gap: Tensor, walls: WallContacts, hops: int) -> Tensor:
+        """The cells deep in others or in a hard wall, and those up to `hops` contacts from the
         former, (N,) bool."""
         count, owner = self.given.radius.numel(), self.groups.owner
         one = torch.cat([pairs.first, pairs.second])
         other = torch.cat([pairs.second, pairs.first])
         gap, deep = gap.repeat(2), self.deep.index_select(0, owner.index_select(0, one))
         mark, near = marked(count, one, gap < -deep), gap < 0.1 * deep
-        for _ in range(HOPS):
+        for _ in range(hops):
             mark = mark | marked(count, one, near & mark.index_select(0, other))
         root, soft = self._wall_roots(walls, torch.ones_like(self.given.radius))
         hard = ~soft & (root >= 1)  # a lighter wall is meant to give way
