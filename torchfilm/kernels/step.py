@@ -44,10 +44,13 @@ from torchfilm.kernels.scheme import (
     HOPS,
     ITERATION_LIMIT,
     LAG,
+    LONG_MOVES,
     MARGIN,
+    MOST_HOPS,
     MOST_SOFTER,
     NOT_FINITE,
     OVERLAP,
+    SHORTER,
     SHRINK,
     SOFTER,
     SOFTEST,
@@ -233,7 +236,7 @@ def step_colony(memory, x, axis, length, growth, radius, viscosity, length_drag,
                 report[PASSES] -= 1  # it is the same pass
                 continue
         pushed = number == 0 and overlaps(rows[1], m)
-        report[CLIPPED] = _carried_out(x, axis, last, pushed, margin, number == 0, arrays, dof)
+        report[CLIPPED] = _carried_out(x, axis, last, pushed, margin, number, arrays, dof)
         number, softer, rising = number + 1, 1.0, True
         if number < passes:
             give_back(memory, top)
@@ -246,15 +249,16 @@ def step_colony(memory, x, axis, length, growth, radius, viscosity, length_drag,
 
 
 @lean
-def _carried_out(x, axis, last, pushed, margin, first_pass, arrays, dof):
-    """Carry out the move, which is bounded about the last one; but without a push nothing moves.
-    That of the first pass becomes the last one. Returns how many cells were cut short."""
+def _carried_out(x, axis, last, pushed, margin, number, arrays, dof):
+    """Carry out the move of a pass. In the first it is bounded about the last one, which it then
+    becomes; but without a push nothing moves. Returns how many cells were cut short."""
     length, least, _, _, _, scale, y, _, about = arrays
     for i in range(last.shape[0]):
         for k in range(last.shape[1]):
             about[i, k] = last[i, k] if pushed else 0.0
-    clipped = move_cells(x, axis, length, y, scale, about, margin, least, dof)
-    if first_pass:
+    bound = margin * (SHORTER if number > LONG_MOVES else 1.0)
+    clipped = move_cells(x, axis, length, y, scale, about, bound, least, dof)
+    if number == 0:
         put(y, last)
     return clipped
 
@@ -266,7 +270,7 @@ def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, number, a
     that lie deep and those near them. Returns the error, each row's gap after the move, and how many rows there are."""
     _, _, half, _, (alpha, low), scale, y, _, _ = arrays
     far = margin * (settings[SOFT] <= 0)
-    some, hops = len(y) * (number > 0), HOPS * number
+    some, hops = len(y) * (number > 0), min(HOPS * number, MOST_HOPS)
     numbers, count, mine = deep_cells(memory, found, rows, walls, deep, some, hops)
     if shares(team, x.shape[0], mine[2].shape[0]):
         m = shared_pair_rows(

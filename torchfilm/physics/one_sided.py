@@ -12,10 +12,13 @@ from torchfilm.kernels.scheme import (
     HARDEST,
     HOPS,
     LAG,
+    LONG_MOVES,
     MARGIN,
     MAX_TURN,
+    MOST_HOPS,
     MOST_SOFTER,
     OVERLAP,
+    SHORTER,
     SHRINK,
     SOFTER,
     SOFTEST,
@@ -91,14 +94,14 @@ class _OneStep:
             if number == 0 and not given.settings.soft:
                 at = replace(at, deeply_overlapping=self._deeply(pairs, gap, active, at))
             if number > 0:
-                moving = self._deep_cells(pairs, gap, walls, HOPS * number)
+                moving = self._deep_cells(pairs, gap, walls, min(HOPS * number, MOST_HOPS))
                 active = active & self.groups.any(moving)
                 of_active = active.index_select(0, self.groups.owner)
                 moving = moving & of_active
                 cells, rows = rows_where(moving, of_active)
                 if not cells.numel():
                     break
-            at = self._pass(at, pairs, walls, moving, cells, active, least, number == 0)
+            at = self._pass(at, pairs, walls, moving, cells, active, least, number)
             active = active & (at.status != NOT_FINITE)
         return at
 
@@ -174,10 +177,10 @@ class _OneStep:
 
     # --- solve and move ------------------------------------------------------------------------
 
-    def _pass(self, at, pairs, walls, moving, cells, active, least, first_pass: bool) -> StepResult:
+    def _pass(self, at, pairs, walls, moving, cells, active, least, number: int) -> StepResult:
         """One solve of the moving cells, (N,) bool and their places, among the others at rest, and
         their moves."""
-        given, settings = self.given, self.given.settings
+        given, settings, first_pass = self.given, self.given.settings, number == 0
         owner = self.groups.owner.index_select(0, pairs.first)
         margin = MARGIN * self.wide.index_select(0, owner)
         contacts = near_rows(pairs, None if settings.soft else margin)
@@ -206,7 +209,7 @@ class _OneStep:
             pushes = part.of_rows.any(part.gap.detach() < 0).index_select(0, self.groups.owner)
             about = torch.where(pushes.unsqueeze(1), at.move[:, : self.dim], about)
         moving = moving & self.of_cells(sound).bool()
-        return self._moved(at, move, about, moving, least, first_pass)
+        return self._moved(at, move, about, moving, least, number)
 
     def _solved(self, at, contacts, walls, moving, cells, active, least, first_pass) -> _Solved:
         """Solve for the moving cells: with softer contacts where a solve does not converge, then
@@ -320,10 +323,11 @@ class _OneStep:
         wanted = torch.where(force > 0, torch.minimum(wanted, self.softest), self.softest)
         return torch.maximum(torch.minimum(wanted, 2 * hardness), HARDEST * self.softest)
 
-    def _moved(self, at, move, about, moving, least, first_pass: bool) -> StepResult:
+    def _moved(self, at, move, about, moving, least, number: int) -> StepResult:
         """Carry out the moves (N, D) of the moving cells: the translation at most MARGIN radii from
-        `about` (N, d), and the rotation as far at the ends."""
-        dim, bound = self.dim, self.of_cells(MARGIN * self.wide)
+        `about` (N, d), or less after many passes, and the rotation as far at the ends."""
+        shorter = SHORTER if number > LONG_MOVES else 1.0
+        dim, bound = self.dim, self.of_cells(shorter * MARGIN * self.wide)
         beyond = move[:, :dim] - about
         way, angle = safe_norm(beyond.T), safe_norm(move[:, dim:-1].T)
         most = (2.0 * bound / at.length.clamp(min=1e-9)).clamp(max=MAX_TURN)
@@ -345,7 +349,7 @@ class _OneStep:
             position=at.position + made[:, :dim].to(at.position.dtype),
             axis=axis,
             length=torch.where(moving, length, at.length),
-            move=torch.where(moving.unsqueeze(1), made, at.move) if first_pass else at.move,
+            move=torch.where(moving.unsqueeze(1), made, at.move) if number == 0 else at.move,
             clipped=torch.where(some, count, at.clipped),
         )
 
