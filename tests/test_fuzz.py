@@ -14,6 +14,7 @@ from helpers import step
 from hypothesis import HealthCheck, given, settings
 
 import torchfilm as tf
+from torchfilm.kernels.scheme import PASSES
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import fuzz
@@ -193,7 +194,7 @@ def test_the_fuzzer_notices_that_the_paths_differ(part):
     assert paths == {"float64, same counts, alike": 2}
     report = after.reports["mechanics"]
     moved = {"position": after.position + 1e-3, "reports": {"mechanics": report}}
-    more = {"reports": {"mechanics": replace(report, passes=report.passes + 8)}}
+    more = {"reports": {"mechanics": replace(report, passes=report.passes + PASSES)}}
     broken = after.replace(**(moved if part == "position" else more))
     with pytest.raises(AssertionError, match=r"paths differ|too many passes"):
         fuzz.both_paths(scene, before, broken, PUSHING, paths)

@@ -195,6 +195,17 @@ def test_case_45_growth_under_pressure_is_that_of_a_tight_solve(measured, length
 
 
 @pytest.mark.slow
+def test_case_41_large_colonies_leave_no_pair_deep(measured):
+    """When half of their cells divide within a few steps, neighbours are turned aside and pushed
+    past each other. Passes are repeated until none is deeper than 0.1 µm."""
+    worst = 0.0
+    for state in tf.simulate(colony(tf.Mechanics(dim=2)), cells=4000, colonies=2, seed=2):
+        if state.cells > 3000:
+            worst = max(worst, float(measure.overlaps(state).worst.max()))
+    assert measured("worst overlap to 4,000 cells, µm", worst, "≤ 0.15") <= 0.15
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("regime", ["free", "pressed"])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_solve_leaves_the_error_of_its_tolerance(regime, dim):
