@@ -323,7 +323,15 @@ def test_interrupted_from_the_keyboard(tmp_path, attempt):
     swallowed there.
     """
     child = started(
-        tmp_path, "microcolony.h5", "microcolony", "--colonies", "2", "--until", "11", "--every", "1"
+        tmp_path,
+        "microcolony.h5",
+        "microcolony",
+        "--colonies",
+        "2",
+        "--until",
+        "11",
+        "--every",
+        "1",
     )
     time.sleep(0.3 + 0.1 * attempt)
     child.send_signal(signal.SIGINT)

@@ -213,12 +213,19 @@ def test_division_without_a_threshold_is_warned_of_unless_something_sets_the_fla
 
     effects = tf.Growth(rate=1.0), tf.Division(), tf.Mechanics(dim=2)
     scene = tf.Scene(*effects)
-    with pytest.warns(UserWarning, match=r"no threshold.*no cell will divide.*length=tf\.Uniform"):
+    with pytest.warns(UserWarning, match=r"no threshold.*no cell divides.*length=tf\.Uniform"):
         model = scene.bind()
     with pytest.raises(tf.InputError, match=r"divide_flag.*to 4 cells.*length=tf\.Uniform.*until"):
         tf.simulate(model, cells=4)
     quiet(lambda: tf.simulate(tf.Scene(tf.Rules(rule), *effects), cells=4))
     quiet(lambda: tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics()).bind())
+
+    class Timer(tf.Division):
+        def step(self, state, dt, values):
+            state = state.with_fields(divide_flag=state.age >= 1.0)
+            return super().step(state, dt, values)
+
+    quiet(lambda: tf.simulate(tf.Scene(tf.Growth(rate=1.0), Timer(), tf.Mechanics()), cells=4))
 
 
 def test_a_rate_per_minute_is_warned_of():

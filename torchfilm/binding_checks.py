@@ -113,9 +113,12 @@ def _divides(effect: BoundEffect) -> bool:
 
 
 def _sets(effects: Sequence[BoundEffect], name: str, effect: BoundEffect) -> bool:
-    """Whether another effect may set a field, or lengthen or add cells in its own way."""
+    """Whether another effect, or the user's own form of this one, may set a field, or lengthen or
+    add cells in its own way."""
     others = [e for e in effects if e.effect is not effect.effect]
-    return any(e.effect.writes_anything or name in e.writes() or is_own(e.effect) for e in others)
+    return is_own(effect.effect) or any(
+        e.effect.writes_anything or name in e.writes() or is_own(e.effect) for e in others
+    )
 
 
 def _check_moves(effect: BoundEffect, name: str, needs: str, state: State, cells: int) -> None:

@@ -199,10 +199,10 @@ def test_case_41_large_colonies_leave_no_pair_deep(measured):
     """When half of their cells divide within a few steps, neighbours are turned aside and pushed
     past each other. Passes are repeated until none is deeper than 0.1 µm."""
     worst = 0.0
-    for state in tf.simulate(colony(tf.Mechanics(dim=2)), cells=4000, colonies=2, seed=2):
+    for state in tf.simulate(colony(tf.Mechanics(dim=2)), cells=4000, colonies=2, seed=3):
         if state.cells > 3000:
             worst = max(worst, float(measure.overlaps(state).worst.max()))
-    assert measured("worst overlap to 4,000 cells, µm", worst, "≤ 0.15") <= 0.15
+    assert measured("worst overlap to 4,000 cells, µm", worst, "≤ 0.11") <= 0.11
 
 
 @pytest.mark.slow
@@ -210,10 +210,10 @@ def test_case_41_large_colonies_leave_no_pair_deep(measured):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_solve_leaves_the_error_of_its_tolerance(regime, dim):
     """The estimate by which a solve stops is near what is left: docs/mechanics.md has the errors
-    of larger colonies. 1.5: there, nine of ten solves keep to it in each kind of colony."""
-    found = list(solve_error.solves(regime, dim, 1, (100, 150, 200, 300, 400, 600)))
+    of larger colonies. 1.6: there, nine of ten solves keep to it in each kind of colony."""
+    found = list(solve_error.solves(regime, dim, 1, (100, 150, 200, 300, 400, 600, 1500, 2000)))
     errors = np.array([s.error for s in found]) / found[0].tolerance
-    assert len(errors) > 5 and np.median(errors) <= 1.0 and np.quantile(errors, 0.9) <= 1.5, errors
+    assert len(errors) > 5 and np.median(errors) <= 1.0 and np.quantile(errors, 0.9) <= 1.6, errors
 
 
 @pytest.mark.slow
@@ -251,8 +251,9 @@ def test_case_46_a_colony_is_pressed_through_a_gap(measured, length_drag):
 def test_case_47_a_heap_parts(measured, dim, cells):
     """Cells at random that fill four fifths of the plane, or of space, many across one another.
 
-    A pass moves a cell by 0.3 µm at most and there are eight in a step, so cells 1 µm deep part
-    within two or three steps, and their neighbours some steps later. No solve fails.
+    The first five passes of a step move a cell by 0.3 µm at most, and the others, up to 24, by 0.1
+    µm. So cells 1 µm deep part within a step or two, and their neighbours some steps later. No
+    solve fails.
     """
     rng = np.random.default_rng(0)
     side = (4.0 * cells) ** 0.5 if dim == 2 else (3.6 * cells) ** (1 / 3)

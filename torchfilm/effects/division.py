@@ -165,8 +165,10 @@ class Division(Effect):
     def idle_without(self, state: State) -> Mapping[str, str]:
         if self.divides_at_threshold or bool(state.fields["divide_flag"].any()):
             return {}
-        no = "Division() has no threshold, and nothing here sets divide_flag: no cell will divide."
-        return {"divide_flag": f"{no} Give it {THRESHOLD}, or a rule that sets the flag."}
+        no = "Division() has no threshold, and nothing here sets divide_flag: no cell divides"
+        return {
+            "divide_flag": f"{no}, unless you set it. Give {THRESHOLD}, or a rule that sets it."
+        }
 
     def check(self, state: State, values: Values) -> None:
         if self.criterion is None or state.cells == 0:

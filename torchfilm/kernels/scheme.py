@@ -38,8 +38,9 @@ SOFTER, MOST_SOFTER = 8.0, 8.0**5
 # those up to twice as far, and so on up to MOST_HOPS: the same few, among others at rest, may find
 # no room. After repeated pass LONG_MOVES a pass moves cells only SHORTER as far. Rows do not
 # foresee how far a turn carries an end aside; of two neighbours that have to part, now the one and
-# now the other would lie deep. (In free growth to 10,000 cells one step in 27 left a pair deeper
-# than 0.3 µm with HOPS alone and 8 passes; with both, none in 8 colonies.)
+# now the other would lie deep. (In free growth to 10,000 cells, with HOPS and long
+# moves alone and 8 passes at most, one step in 27 left a pair deeper than 0.3 µm; so, none did in 8
+# colonies.)
 HOPS, MOST_HOPS = 3, 9
 LONG_MOVES, SHORTER = 4, 1 / 3
 # No cell turns by more than this in one pass, rad. Bilateral contacts have the same bound.
@@ -47,16 +48,16 @@ MAX_TURN = 0.5
 # Relative error of the contact forces that a solve leaves, root mean square; passes at most.
 TOLERANCE, PASSES = 0.07, 24
 # The share of a Newton round's residual that CG leaves: in the first EASY_ROUNDS, which are enough
-# for most solves, and in those after. These are solves of contacts that hardly hold each other in
-# place. With the first share they would stop at up to four times the tolerance: local residuals
-# would hide how far slow moves are from their end.
+# for most solves, and in those after. Longer solves are those of contacts that hardly hold each
+# other in place. With the first share they would stop at up to four times the tolerance: local
+# residuals would hide how far slow moves are from their end.
 FORCING, FORCING_LATE, EASY_ROUNDS = 0.2, 0.1, 5
 # The share of a round's slope that the line search leaves; rounds a solve, and looks a line search,
 # at most.
 LEVEL = 0.1
 MOST_ROUNDS, MOST_LOOKS = 200, 30
-# CG ends where the curvature along its direction is this share of rz or less: numbers so small are
-# no longer numbers in float32.
+# CG ends where the curvature along its direction is this share of rz or less. They are about equal,
+# until rounding leaves nothing of the curvature; a step of rz over it would not be a number.
 FLAT = 1e-30
 # A block's diagonal is raised by this share before it is inverted, in float64.
 RAISED = 1e-9

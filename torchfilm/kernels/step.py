@@ -267,7 +267,8 @@ def _carried_out(x, axis, last, pushed, margin, number, arrays, dof):
 def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, number, arrays, cap,
             settings, report, team, dof):  # fmt: skip
     """Solve a pass, of which `walls` rows are made: the first for all cells, a later one for those
-    that lie deep and those near them. Returns the error, each row's gap after the move, and how many rows there are."""
+    that lie deep and those near them. Returns the error, each row's gap after the move, and how
+    many rows there are."""
     _, _, half, _, (alpha, low), scale, y, _, _ = arrays
     far = margin * (settings[SOFT] <= 0)
     some, hops = len(y) * (number > 0), min(HOPS * number, MOST_HOPS)
