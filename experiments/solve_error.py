@@ -58,7 +58,8 @@ def error_left(problem: ContactProblem, end: Minimum, cap: Tensor) -> float:
     tight = minimise(problem, end.y, TIGHT, cap, MOST)
     counted = torch.minimum(end.after.double().clamp(max=0.0) ** 2, cap**2)
     fall = energy(problem, end) - energy(problem, tight)
-    return (2.0 * max(fall, 0.0) / float(counted.sum())) ** 0.5
+    # where nothing overlaps any more, relative to contacts as deep as counted: see `minimise`
+    return (2.0 * max(fall, 0.0) / float(counted.sum() or cap**2)) ** 0.5
 
 
 def solves(regime: str, dim: int, seed: int, sizes: tuple[int, ...]) -> Iterator[Solve]:

@@ -322,17 +322,8 @@ def test_interrupted_from_the_keyboard(tmp_path, attempt):
     Several times, because an interrupt that falls into a callback of the interpreter is easily
     swallowed there.
     """
-    child = started(
-        tmp_path,
-        "microcolony.h5",
-        "microcolony",
-        "--colonies",
-        "2",
-        "--until",
-        "11",
-        "--every",
-        "1",
-    )
+    command = "microcolony --colonies 2 --until 11 --every 1"
+    child = started(tmp_path, "microcolony.h5", *command.split())
     time.sleep(0.3 + 0.1 * attempt)
     child.send_signal(signal.SIGINT)
     _, errors = child.communicate(timeout=600)

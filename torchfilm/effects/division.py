@@ -31,7 +31,7 @@ from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, phy
 
 CRITERIA = ("length", "volume", "added")
 TOO_SHORT = 1
-PIXELS = 10.0  # µm; of a longer first cell, messages say that lengths may be in pixels
+PIXELS = 10.0  # µm; for a longer first cell, messages say that lengths may be in pixels
 THRESHOLD = "a threshold (such as length=tf.Uniform(3.5, 4.5))"  # what it needs without rules
 
 
@@ -165,9 +165,9 @@ class Division(Effect):
     def idle_without(self, state: State) -> Mapping[str, str]:
         if self.divides_at_threshold or bool(state.fields["divide_flag"].any()):
             return {}
-        no = "Division() has no threshold, and nothing here sets divide_flag: no cell divides"
         return {
-            "divide_flag": f"{no}, unless you set it. Give {THRESHOLD}, or a rule that sets it."
+            "divide_flag": "Division() has no threshold, and nothing here sets divide_flag: no cell"
+            f" divides, unless you set it. Give {THRESHOLD}, or a rule that sets it."
         }
 
     def check(self, state: State, values: Values) -> None:

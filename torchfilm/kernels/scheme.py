@@ -38,9 +38,8 @@ SOFTER, MOST_SOFTER = 8.0, 8.0**5
 # those up to twice as far, and so on up to MOST_HOPS: the same few, among others at rest, may find
 # no room. After repeated pass LONG_MOVES a pass moves cells only SHORTER as far. Rows do not
 # foresee how far a turn carries an end aside; of two neighbours that have to part, now the one and
-# now the other would lie deep. (In free growth to 10,000 cells, with HOPS and long
-# moves alone and 8 passes at most, one step in 27 left a pair deeper than 0.3 µm; so, none did in 8
-# colonies.)
+# now the other would lie deep. (In free growth to 10,000 cells, with HOPS and long moves alone and
+# 8 passes at most, one step in 27 left a pair deeper than 0.3 µm; so, none did in 8 colonies.)
 HOPS, MOST_HOPS = 3, 9
 LONG_MOVES, SHORTER = 4, 1 / 3
 # No cell turns by more than this in one pass, rad. Bilateral contacts have the same bound.

@@ -126,7 +126,7 @@ def _work_of(pushed, q):
 
 
 @lean
-def _share(rz, curvature):
+def _step_length(rz, curvature):
     """How far to go along a direction; 0 where rounding leaves no curvature, as at the end of a
     solve that is nearly exact."""
     return rz / curvature if curvature > FLAT * rz else 0.0
@@ -140,7 +140,7 @@ def cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof):
     add_product(H, one, two, on, p, z, dof)
     for a in range(0, n, BLOCK):
         curvature += add_curvature(alpha, z, p, a, min(a + BLOCK, n), dof)
-    t[0] = _share(rz, curvature)
+    t[0] = _step_length(rz, curvature)
     for a in range(0, n, BLOCK):
         new += go_along(d, g, z, p, inverse, t[0], a, min(a + BLOCK, n), dof)
     return new
@@ -150,7 +150,7 @@ def cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof):
 def _shared_cg_step(team, rz, t):
     """As `cg_step`, by a team."""
     share_out(team, PRODUCT)
-    t[0] = _share(rz, total_of(team, 0))
+    t[0] = _step_length(rz, total_of(team, 0))
     share_out(team, ALONG)
     return total_of(team, 0)
 

@@ -135,8 +135,8 @@ def board_at(address):
 
 
 def new_board(threads: int, least: int, taker: int) -> np.ndarray:
-    """A board for so many threads, which share colonies of `least` cells. taker: the address
-    of what they do pieces by."""
+    """A board for so many threads, which share colonies of `least` cells or more. taker: the
+    address of what they do pieces by."""
     board = np.zeros(WORDS, np.int64)
     board[THREADS], board[LEAST], board[TAKER] = threads, least, taker
     return board
