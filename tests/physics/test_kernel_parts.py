@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import torchfilm as tf
-from torchfilm.kernels import colonies, contacts, functions, lanes, moves, neighbours
+from torchfilm.kernels import colonies, contacts, functions, lanes, moves, neighbours, wall_moves
 from torchfilm.kernels.compiling import for_python
 from torchfilm.kernels.memory import no_memory
 from torchfilm.physics import substeps
@@ -173,8 +173,11 @@ def test_no_cells_come_nearer_than_told(dim, spread, own):
     gaps = lambda: near_contacts(no_memory(), x, axis, half, radius, first, second, margin, dof)[2]
     before, length = gaps(), 2 * half
     scale, least = np.ones_like(y), np.zeros(60)
-    about = np.zeros_like(y)
-    for_python(moves.move_cells)(x, axis, length, y, scale, about, 1e9, least, dof)
+    about, none = np.zeros_like(y), np.zeros((0, 3))
+    no_walls = none[:, 0], none, none[:, 0], none[:, 0] > 0, none
+    for_python(wall_moves.move_cells)(
+        x, axis, length, radius, y, scale, about, 1e9, least, no_walls, np.zeros((3, len(dof))), dof
+    )
     half = 0.5 * length
     (all_, each), after = for_python(moves.approach)(no_memory(), x, length, radius, y, dof), gaps()
     told = all_ + each[first] + each[second]

@@ -11,6 +11,9 @@ from torchfilm.kernels.memory import room, zeros
 from torchfilm.kernels.rows import degrees
 from torchfilm.kernels.scheme import MAX_TURN
 
+# Rows of the scratch of a move: the move itself, and the position and axis on the way.
+MOVE, AT, WAY = range(3)
+
 
 @lean
 def drags(length, radius, viscosity, length_drag, growth, scale, dof):
@@ -50,42 +53,48 @@ def rotate(axis, i, tx, ty, tz, angle, dof):
         axis[i, 0], axis[i, 1], axis[i, 2] = bx / size, by / size, bz / size
 
 
-@lean
-def move_cells(x, axis, length, y, scale, about, bound, least, dof):
-    """Carry out the move y, its translation at most `bound` from `about` (n, D), and its rotation
-    at most `bound` at the ends. Returns how many were cut short."""
+@lean(inline=True)
+def carry_out(x, axis, length, y, i, scratch, angle, least, dof):
+    """Carry out the move of cell i, scratch[MOVE], in which it turns by `angle`; then y[i] is that
+    move."""
     D = degrees(dof)
     d = 2 if D == 4 else 3
-    clipped = 0
-    for i in range(x.shape[0]):
-        way = 0.0
-        for k in range(d):
-            way += (y[i, k] * scale[i, k] - about[i, k]) ** 2
-        part = bound / math.sqrt(way) if way > bound * bound else 1.0
-        angle = 0.0
-        for k in range(d, D - 1):
-            angle += (y[i, k] * scale[i, k]) ** 2
-        angle = math.sqrt(angle)
-        most = min(2.0 * bound / max(length[i], 1e-9), MAX_TURN)
-        turn = most / angle if angle > most else 1.0
-        if part < 1.0 or turn < 1.0:
-            clipped += 1
-        for k in range(d):
-            step = about[i, k] + part * (y[i, k] * scale[i, k] - about[i, k])
-            y[i, k] = step
-            x[i, k] += step
-        for k in range(d, D - 1):
-            y[i, k] *= turn * scale[i, k]
-        y[i, D - 1] *= scale[i, D - 1]
-        ty, tz = (y[i, d + 1], y[i, d + 2]) if d == 3 else (0.0, 0.0)
-        rotate(axis, i, y[i, d], ty, tz, angle * turn, dof)
-        length[i] = max(length[i] + y[i, D - 1], least[i])
-    return clipped
+    for k in range(D):
+        y[i, k] = scratch[MOVE, k]
+    for k in range(d):
+        x[i, k] += scratch[MOVE, k]
+    ty, tz = (y[i, d + 1], y[i, d + 2]) if d == 3 else (0.0, 0.0)
+    rotate(axis, i, y[i, d], ty, tz, angle, dof)
+    length[i] = max(length[i] + y[i, D - 1], least)
+
+
+@lean
+def bounded(y, i, scale, about, bound, length, scratch, dof):
+    """Puts the move of cell i into scratch[MOVE]: its translation at most `bound` from `about`
+    (n, D), and its rotation at most `bound` at the ends. Returns the angle, and whether it was cut
+    short."""
+    D = degrees(dof)
+    d = 2 if D == 4 else 3
+    way, angle = 0.0, 0.0
+    for k in range(d):
+        way += (y[i, k] * scale[i, k] - about[i, k]) ** 2
+    part = bound / math.sqrt(way) if way > bound * bound else 1.0
+    for k in range(d, D - 1):
+        angle += (y[i, k] * scale[i, k]) ** 2
+    angle = math.sqrt(angle)
+    most = min(2.0 * bound / max(length, 1e-9), MAX_TURN)
+    turn = most / angle if angle > most else 1.0
+    for k in range(d):
+        scratch[MOVE, k] = about[i, k] + part * (y[i, k] * scale[i, k] - about[i, k])
+    for k in range(d, D - 1):
+        scratch[MOVE, k] = y[i, k] * (turn * scale[i, k])
+    scratch[MOVE, D - 1] = y[i, D - 1] * scale[i, D - 1]
+    return angle * turn, part < 1.0 or turn < 1.0
 
 
 @lean
 def approach(memory, x, length, radius, y, dof):
-    """How much nearer, at most, cells can have come by the move y of `move_cells`, µm: any two that
+    """How much nearer, at most, cells can have come by the move y (n, D), µm: any two that
     are near, and what each adds to that, (n,).
 
     Cells of a growing colony move far, but neighbours almost alike: they part in proportion to

@@ -22,12 +22,12 @@ from torchfilm.kernels.colonies import (
     shortest_of,
     taken_out,
 )
-from torchfilm.kernels.compiling import kernel, lean
+from torchfilm.kernels.compiling import lean
 from torchfilm.kernels.contact_pieces import shared_pair_rows, shares
 from torchfilm.kernels.contacts import most_rows, pair_rows
 from torchfilm.kernels.found import deep_cells, found_after, found_contacts
-from torchfilm.kernels.memory import TOP, give_back, room, zeros
-from torchfilm.kernels.moves import drags, move_cells
+from torchfilm.kernels.memory import TOP, copied, give_back, room, zeros
+from torchfilm.kernels.moves import drags
 from torchfilm.kernels.neighbours import spatial_order
 from torchfilm.kernels.rows import (
     HARD,
@@ -59,6 +59,7 @@ from torchfilm.kernels.scheme import (
 from torchfilm.kernels.solve import minimise
 from torchfilm.kernels.solve_parts import overlaps
 from torchfilm.kernels.team import next_of
+from torchfilm.kernels.wall_moves import move_cells
 
 # Places in the settings. DEEP ≤ 0: TOO_DEEP radii. YIELD: mean overlap
 # of contacts, radii.
@@ -68,9 +69,9 @@ DEEP, TOLERANCE, MOST_PASSES, LIMIT, SOFT, YIELD = range(6)
 @lean
 def _wall_contacts(memory, x, axis, half, radius, scale, at, found, like, dof):
     """Rows (H, gaps, one, two, soft) of cells at walls, with room for those of the contacts
-    `found`; how many there are, and the deepest gap. at: kinds, places and sizes of walls and
-    which are soft, and weight and reach by cell."""
-    (kinds, places, sizes, is_soft), root, reach = at
+    `found`; how many there are, and the deepest gap. at: the walls, and weight and reach by
+    cell."""
+    (kinds, places, sizes, is_soft, _), root, reach = at
     most = most_rows(dof) * found[4].shape[0] + 3 * kinds.shape[0] * x.shape[0]
     rows = room_for_rows(memory, most, like, dof)
     walls, deepest = wall_rows(
@@ -165,14 +166,14 @@ def _arrays(memory, length, growth, shortest, last, roots):
 
 @lean
 def _prepared(memory, x, axis, growth, radius, viscosity, length_drag, last, first_pass, rising,
-              hardness, softer, walls, roots, alphas, margin, found, arrays, dof):  # fmt: skip
+              hardness, softer, walls, alphas, margin, found, arrays, dof):  # fmt: skip
     """Puts what a pass starts from into its arrays. Returns rows of cells at walls, with room for
     those of `found`, how many there are, and the deepest gap."""
     length, least, half, (reach, root), (alpha, low), scale, y, _, _ = arrays
     drags(length, radius, viscosity, length_drag, growth, scale, dof)
     _put_start(y, last, scale, first_pass, rising)
     _numbers(
-        x, length, scale, growth, least, last, first_pass, hardness, softer, roots, walls[3],
+        x, length, scale, growth, least, last, first_pass, hardness, softer, walls[4], walls[3],
         alphas, margin, alpha, low, reach, root, dof,
     )  # fmt: skip
     at = walls, root, reach
@@ -181,17 +182,17 @@ def _prepared(memory, x, axis, growth, radius, viscosity, length_drag, last, fir
 
 @lean
 def step_colony(memory, x, axis, length, growth, radius, viscosity, length_drag, shortest, last,
-                hardness, walls, roots, alphas, settings, report, team, dof):  # fmt: skip
+                hardness, walls, alphas, settings, report, team, dof):  # fmt: skip
     """Grow one colony by `growth` and part what overlaps; x, axis, length, last, hardness in place.
 
     x, axis (n, d) float64. length to shortest: (n,). last: (n, D) the move from which to start.
-    hardness: (1,) α. walls: kinds, places, sizes, which are soft; roots: (S, n) their D, or
+    hardness: (1,) α. walls: kinds, places, sizes, which are soft, and (S, n) their D, or
     stiffness · Δt. alphas: (n,), or (0,).
     """
     margin, target, deep, softest, passes = _of_colony(length, growth, radius, viscosity, settings)
     tolerance, given, is_soft = settings[TOLERANCE], alphas.shape[0] > 0, walls[3]
     hardness[0] = hardness[0] if hardness[0] > 0 else softest
-    arrays = _arrays(memory, length, growth, shortest, last, roots)
+    arrays = _arrays(memory, length, growth, shortest, last, walls[4])
     half, y, kept = arrays[2], arrays[6], arrays[7]
     number, deeply, softer, rising, held, kept_alpha = 0, False, 1.0, True, 0.0, 0.0
     found = found_contacts(memory, team, x, axis, half, radius, margin, dof)
@@ -201,13 +202,12 @@ def step_colony(memory, x, axis, length, growth, radius, viscosity, length_drag,
         give_back(memory, top)  # the contacts are kept, not what was made of them
         rows, at_walls, deepest = _prepared(
             memory, x, axis, growth, radius, viscosity, length_drag, last, number == 0, rising,
-            hardness[0], softer, walls, roots, alphas, margin, found, arrays, dof,
+            hardness[0], softer, walls, alphas, margin, found, arrays, dof,
         )  # fmt: skip
         if number > 0 and not deeply:  # cells do not lie deep in others; but in a wall?
             if deepest >= -deep:
                 break
-            found = found_contacts(memory, team, x, axis, half, radius, margin, dof)
-            deeply = True
+            found, deeply = found_contacts(memory, team, x, axis, half, radius, margin, dof), True
             top = memory[1][TOP]
             continue
         error, e, m = _solved(
@@ -235,8 +235,9 @@ def step_colony(memory, x, axis, length, growth, radius, viscosity, length_drag,
                 held, kept_alpha, rising = error, before, False
                 report[PASSES] -= 1  # it is the same pass
                 continue
-        pushed = number == 0 and overlaps(rows[1], m)
-        report[CLIPPED] = _carried_out(x, axis, last, pushed, margin, number, arrays, dof)
+        report[CLIPPED] = _carried_out(
+            memory, x, axis, radius, last, rows[1][:m], walls, margin, number, arrays, dof
+        )
         number, softer, rising = number + 1, 1.0, True
         if number < passes:
             give_back(memory, top)
@@ -249,15 +250,20 @@ def step_colony(memory, x, axis, length, growth, radius, viscosity, length_drag,
 
 
 @lean
-def _carried_out(x, axis, last, pushed, margin, number, arrays, dof):
+def _carried_out(memory, x, axis, radius, last, gaps, walls, margin, number, arrays, dof):
     """Carry out the move of a pass. In the first it is bounded about the last one, which it then
-    becomes; but without a push nothing moves. Returns how many cells were cut short."""
+    becomes; but without a push, by the rows' gaps, nothing moves. Returns how many cells were cut
+    short."""
     length, least, _, _, _, scale, y, _, about = arrays
+    pushed = number == 0 and overlaps(gaps, gaps.shape[0])
+    scratch = room(memory, (3, len(dof)), np.float64)
     for i in range(last.shape[0]):
         for k in range(last.shape[1]):
             about[i, k] = last[i, k] if pushed else 0.0
     bound = margin * (SHORTER if number > LONG_MOVES else 1.0)
-    clipped = move_cells(x, axis, length, y, scale, about, bound, least, dof)
+    clipped = move_cells(
+        x, axis, length, radius, y, scale, about, bound, least, walls, scratch, dof
+    )
     if number == 0:
         put(y, last)
     return clipped
@@ -329,7 +335,23 @@ def _following(e, soft, hardness, target, softest):
     return max(min(wanted, 2.0 * hardness), HARDEST * softest)
 
 
-@kernel(entry=True)
+@lean
+def _largest(values):
+    largest = values[0]
+    for k in range(values.shape[0]):
+        largest = max(largest, values[k])
+    return largest
+
+
+@lean
+def _mean(values):
+    total = 0.0
+    for k in range(values.shape[0]):
+        total += values[k]
+    return total / values.shape[0]
+
+
+@lean(entry=True)
 def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, alphas, walls,
                   settings, out, reports, dof):  # fmt: skip
     """Steps of the colonies `which`, each by itself: `kernels.colonies` describes the arguments.
@@ -344,7 +366,8 @@ def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, 
         first, end, report = begin[b], begin[b + 1], reports[b]
         if first == end:
             continue
-        hardness = np.array([contact_alpha[first:end].max()], np.float64)
+        hardness = room(memory, (1,), np.float64)
+        hardness[0] = _largest(contact_alpha[first:end])
         if opened(first, end, longest, cells, drags, out, report):
             steps = int(report[SUBSTEPS])
             of = spatial_order(memory, x[first:end], 6.0 * radius[first])
@@ -355,15 +378,15 @@ def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, 
             )
             shortest = shortest_of(memory, of, length, own_radius, cells)
             own_alphas = alphas_of(memory, of, dt / steps, alphas)
-            own_settings = settings.copy()
+            own_settings = copied(memory, settings, settings.shape[0])
             if steps > 1 and settings[DEEP] <= 0:
-                own_settings[DEEP] = DEEP_IN_SUBSTEPS * radius[first:end].mean()
+                own_settings[DEEP] = DEEP_IN_SUBSTEPS * _mean(own_radius)
             top = memory[1][TOP]
             for _ in range(steps):
                 give_back(memory, top)
                 step_colony(
                     memory, own_x, own_axis, length, share, own_radius, viscosity, drag, shortest,
-                    last, hardness, (kinds, places[:, b], sizes[:, b], is_soft), roots, own_alphas,
+                    last, hardness, (kinds, places[:, b], sizes[:, b], is_soft, roots), own_alphas,
                     own_settings, report, team, dof,
                 )  # fmt: skip
                 if report[STATUS] == NOT_FINITE:

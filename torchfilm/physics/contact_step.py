@@ -32,7 +32,7 @@ from torchfilm.physics.contacts import CandidateContacts, Contacts, contacts_of
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.problem import NOT_FINITE, ContactProblem, SolveReport
 from torchfilm.physics.solve import solve_contacts
-from torchfilm.physics.wall_contacts import WallContacts, share_to_walls
+from torchfilm.physics.wall_contacts import WallContacts, poses_along, share_to_walls
 from torchfilm.tools.reads import known_rows_where, numbers, rows_where
 
 
@@ -188,15 +188,7 @@ def _share(cells: CellProperties, at: Moved, move: Tensor) -> tuple[Tensor, Tens
     far = rows_where(share * reach > radius)[0] if cells.surfaces else radius.new_empty(0)
     if far.numel():
         pick = lambda x: x.index_select(0, far)
-        position, axis, length = pick(at.position), pick(at.axis), pick(at.length)
         part = pick(move) * pick(share).unsqueeze(1)
-
-        def placed(s):
-            return (
-                position + s * part[:, :dim].to(position.dtype),
-                capsule.rotate(axis, s * part[:, dim:-1]),
-                0.5 * (length + s * part[:, -1]),
-            )
-
+        placed = poses_along(pick(at.position), pick(at.axis), pick(at.length), part)
         share[far] *= share_to_walls(cells.surfaces, placed, pick(radius), pick(cells.colony_ids))
     return reach, share

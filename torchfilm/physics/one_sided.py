@@ -34,7 +34,12 @@ from torchfilm.physics.one_sided_solve import Minimum, minimise
 from torchfilm.physics.problem import CONVERGED, ITERATION_LIMIT, NOT_FINITE, ContactProblem
 from torchfilm.physics.solve import warn_if_loose
 from torchfilm.physics.step_records import StepInput, StepResult
-from torchfilm.physics.wall_contacts import WallContacts, find_wall_contacts
+from torchfilm.physics.wall_contacts import (
+    WallContacts,
+    find_wall_contacts,
+    poses_along,
+    share_to_walls,
+)
 from torchfilm.tools.ragged import marked
 from torchfilm.tools.reads import numbers, rows_where
 from torchfilm.tools.vectors import safe_norm
@@ -325,7 +330,8 @@ class _OneStep:
 
     def _moved(self, at, move, about, moving, least, number: int) -> StepResult:
         """Carry out the moves (N, D) of the moving cells: the translation at most MARGIN radii from
-        `about` (N, d), or less after many passes, and the rotation as far at the ends."""
+        `about` (N, d), or less after many passes, the rotation as far at the ends, and none through
+        a hard wall."""
         shorter = SHORTER if number > LONG_MOVES else 1.0
         dim, bound = self.dim, self.of_cells(shorter * MARGIN * self.wide)
         beyond = move[:, :dim] - about
@@ -335,9 +341,11 @@ class _OneStep:
             torch.where(x > limit, limit / torch.where(x > limit, x, 1.0), 1.0)
             for x, limit in ((way, bound), (angle, most))
         )
-        clipped = moving & ((part < 1) | (turn < 1))
         step = about + part.unsqueeze(1) * beyond
         made = torch.cat([step, turn.unsqueeze(1) * move[:, dim:-1], move[:, -1:]], 1)
+        share = self._share_to_hard_walls(at, made.detach())
+        clipped = moving & ((part < 1) | (turn < 1) | (share < 1))
+        made = share.unsqueeze(1) * made
         made = torch.where(moving.unsqueeze(1), made, 0.0)
         axis = torch.where(moving.unsqueeze(1), capsule.rotate(at.axis, made[:, dim:-1]), at.axis)
         length = at.length + made[:, -1]
@@ -352,6 +360,24 @@ class _OneStep:
             move=torch.where(moving.unsqueeze(1), made, at.move) if number == 0 else at.move,
             clipped=torch.where(some, count, at.clipped),
         )
+
+    @torch.no_grad()
+    def _share_to_hard_walls(self, at, made: Tensor) -> Tensor:
+        """The share of each move (N, D) that no hard wall cuts off, (N,)."""
+        given, dim = self.given, self.dim
+        share = torch.ones_like(given.radius)
+        way, angle = (x.square().sum(1).sqrt() for x in (made[:, :dim], made[:, dim:-1]))
+        reach = way + 0.5 * angle * at.length + 0.5 * made[:, -1].clamp(min=0.0)
+        placed = poses_along(at.position, at.axis, at.length, made)
+        for surface, (kind, weight) in zip(given.surfaces, given.walls, strict=True):
+            if kind == "stiffness":
+                continue
+            cut = share_to_walls([surface], placed, given.radius, given.colony_ids)
+            hard = (
+                reach > given.radius if weight is None else (reach > given.radius) & (weight >= 1)
+            )
+            share = torch.where(hard, torch.minimum(share, cut), share)
+        return share
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.kernels.bilateral_scheme import NEAR, POINTS_ON_MOVE
+from torchfilm.physics.capsule import rotate
 from torchfilm.physics.surfaces import FlatSurface, Surface
 from torchfilm.tools.reads import rows_where
 from torchfilm.tools.vectors import cross, dot, safe_sqrt
@@ -110,6 +111,20 @@ def _contact_candidates(
     ]
 
 
+def poses_along(position: Tensor, axis: Tensor, length: Tensor, move: Tensor):
+    """Poses of cells after a share of their moves (N, D), as `share_to_walls` takes them."""
+    dim = position.shape[1]
+
+    def at(share: float) -> Pose:
+        return (
+            position + share * move[:, :dim].to(position.dtype),
+            rotate(axis, share * move[:, dim:-1]),
+            0.5 * (length + share * move[:, -1]),
+        )
+
+    return at
+
+
 @torch.no_grad()
 def share_to_walls(
     surfaces: Sequence[Surface], at: Callable[[float], Pose], radius: Tensor, colony_id: Tensor
@@ -117,8 +132,8 @@ def share_to_walls(
     """The share of its move after which each cell is at most its radius behind any wall, (P,).
 
     A cell that was already deeper may stay as deep as it was. The check is needed because a wall
-    that a cell did not touch before the move has no row in the solve. at: returns, for a share of
-    the move, position (P, d) float64, axis (P, d) and half length (P,).
+    that a cell did not touch before the move may have no row in the solve. at: returns, for a share
+    of the move, position (P, d) float64, axis (P, d) and half length (P,).
     """
 
     def gap(surface: Surface, share: float) -> Tensor:
