@@ -35,17 +35,17 @@ def make_moves(x, axis, length, radius, y, scale, base, kinds, places, sizes, cl
         reach = way + 0.5 * turn * length[i] + 0.5 * max(scratch[MOVE, D - 1], 0.0)
         for k in range(D):
             scratch[MOVE, k] *= share
-        if share * reach > radius[i]:
-            part = 1.0
-            for w in range(kinds.shape[0]):
-                wall = kinds[w], places[w], sizes[w]
-                part = min(part, share_to_wall(
-                    *wall, x, axis, i, length[i], radius[i], scratch, share * turn, dof
-                ))  # fmt: skip
-            for k in range(D):
-                scratch[MOVE, k] *= part
-            share *= part
+        part = 1.0
+        for w in range(kinds.shape[0]):
+            wall, ways = (kinds[w], places[w], sizes[w]), (share * turn, share * reach)
+            part = min(part, share_to_wall(
+                *wall, x, axis, i, length[i], radius[i], scratch, *ways, dof
+            ))  # fmt: skip
+        share *= part
         clipped[i] = share < 1
         count += clipped[i]
+        for k in range(D):
+            y[i, k] *= share
+            scratch[MOVE, k] = y[i, k] * scale[i, k]
         carry_out(x, axis, length, y, i, scratch, share * turn, base[i], dof)
     return count

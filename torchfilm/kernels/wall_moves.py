@@ -46,12 +46,15 @@ def _depth_after(kind, place, size, x, axis, i, length, radius, scratch, share, 
 
 
 @lean
-def share_to_wall(kind, place, size, x, axis, i, length, radius, scratch, turn, dof):
-    """The share of its move after which cell i is at most its radius behind a wall; one that was
-    deeper may stay so. A wall that it did not touch may have no row in the solve."""
+def share_to_wall(kind, place, size, x, axis, i, length, radius, scratch, turn, reach, dof):
+    """The share of its move after which cell i, no point of which moves farther than `reach`, µm,
+    comes to lie its radius behind a wall, nearly; one that was deeper gets no deeper. A wall that
+    it did not touch may have no row in the solve."""
     out, points = 1.0, POINTS_ON_MOVE if kind == OUTSIDE else 1
     before = _depth(kind, place, size, x, i, axis, i, 0.5 * length, radius, dof)
-    limit = min(before, 0.0) - radius
+    limit = min(before, -radius)
+    if before - reach >= limit:
+        return out
     for k in range(points):
         after = _depth_after(
             kind, place, size, x, axis, i, length, radius, scratch, (k + 1) / points, turn, dof
@@ -65,9 +68,9 @@ def share_to_wall(kind, place, size, x, axis, i, length, radius, scratch, turn, 
 @lean
 def move_cells(x, axis, length, radius, y, scale, about, bound, least, walls, scratch, dof):
     """Carry out the scaled move y (n, D) of a pass: translations at most `bound` from `about`
-    (n, D), rotations at most `bound` at the ends, and none through a hard wall. Then y is what was
-    done. Returns how many cells were cut short. walls: kinds, places, sizes, which are soft, and
-    their weights (S, n)."""
+    (n, D), rotations at most `bound` at the ends, and no cell deeper than its radius behind a hard
+    wall. Then y is what was done. Returns how many cells were cut short. walls: kinds, places,
+    sizes, which are soft, and their weights (S, n)."""
     D = degrees(dof)
     count = 0
     for i in range(x.shape[0]):
@@ -94,9 +97,10 @@ def _share_to_hard_walls(x, axis, i, length, radius, scratch, angle, walls, dof)
     for k in range(2 if len(dof) == 4 else 3):
         way += scratch[MOVE, k] * scratch[MOVE, k]
     reach = math.sqrt(way) + 0.5 * angle * length + 0.5 * max(scratch[MOVE, end], 0.0)
-    for w in range(kinds.shape[0] if reach > radius else 0):
+    for w in range(kinds.shape[0]):
         if not is_soft[w] and weights[w, i] >= 1.0:
+            wall = kinds[w], places[w], sizes[w]
             part = min(part, share_to_wall(
-                kinds[w], places[w], sizes[w], x, axis, i, length, radius, scratch, angle, dof
+                *wall, x, axis, i, length, radius, scratch, angle, reach, dof
             ))  # fmt: skip
     return part

@@ -185,10 +185,6 @@ def _share(cells: CellProperties, at: Moved, move: Tensor) -> tuple[Tensor, Tens
     turn, way = (x.square().sum(1).sqrt() for x in (move[:, dim:-1], move[:, :dim]))
     share = (MAX_TURN / turn).clamp(max=1.0)
     reach = way + 0.5 * turn * at.length + 0.5 * move[:, -1].clamp(min=0.0)
-    far = rows_where(share * reach > radius)[0] if cells.surfaces else radius.new_empty(0)
-    if far.numel():
-        pick = lambda x: x.index_select(0, far)
-        part = pick(move) * pick(share).unsqueeze(1)
-        placed = poses_along(pick(at.position), pick(at.axis), pick(at.length), part)
-        share[far] *= share_to_walls(cells.surfaces, placed, pick(radius), pick(cells.colony_ids))
-    return reach, share
+    placed = poses_along(at.position, at.axis, at.length, share.unsqueeze(1) * move)
+    cut = share_to_walls(cells.surfaces, placed, radius, cells.colony_ids, share * reach)
+    return reach, share * cut

@@ -330,8 +330,8 @@ class _OneStep:
 
     def _moved(self, at, move, about, moving, least, number: int) -> StepResult:
         """Carry out the moves (N, D) of the moving cells: the translation at most MARGIN radii from
-        `about` (N, d), or less after many passes, the rotation as far at the ends, and none through
-        a hard wall."""
+        `about` (N, d), or less after many passes, the rotation as far at the ends; and a cell comes
+        no deeper than its radius behind a hard wall."""
         shorter = SHORTER if number > LONG_MOVES else 1.0
         dim, bound = self.dim, self.of_cells(shorter * MARGIN * self.wide)
         beyond = move[:, :dim] - about
@@ -343,7 +343,7 @@ class _OneStep:
         )
         step = about + part.unsqueeze(1) * beyond
         made = torch.cat([step, turn.unsqueeze(1) * move[:, dim:-1], move[:, -1:]], 1)
-        share = self._share_to_hard_walls(at, made.detach())
+        share = self._share_to_hard_walls(at, made)
         clipped = moving & ((part < 1) | (turn < 1) | (share < 1))
         made = share.unsqueeze(1) * made
         made = torch.where(moving.unsqueeze(1), made, 0.0)
@@ -361,22 +361,19 @@ class _OneStep:
             clipped=torch.where(some, count, at.clipped),
         )
 
-    @torch.no_grad()
     def _share_to_hard_walls(self, at, made: Tensor) -> Tensor:
         """The share of each move (N, D) that no hard wall cuts off, (N,)."""
-        given, dim = self.given, self.dim
+        given, dim, move = self.given, self.dim, made.detach()
         share = torch.ones_like(given.radius)
-        way, angle = (x.square().sum(1).sqrt() for x in (made[:, :dim], made[:, dim:-1]))
-        reach = way + 0.5 * angle * at.length + 0.5 * made[:, -1].clamp(min=0.0)
+        way, angle = (x.square().sum(1).sqrt() for x in (move[:, :dim], move[:, dim:-1]))
+        reach = way + 0.5 * angle * at.length.detach() + 0.5 * move[:, -1].clamp(min=0.0)
         placed = poses_along(at.position, at.axis, at.length, made)
         for surface, (kind, weight) in zip(given.surfaces, given.walls, strict=True):
             if kind == "stiffness":
                 continue
-            cut = share_to_walls([surface], placed, given.radius, given.colony_ids)
-            hard = (
-                reach > given.radius if weight is None else (reach > given.radius) & (weight >= 1)
-            )
-            share = torch.where(hard, torch.minimum(share, cut), share)
+            cut = share_to_walls([surface], placed, given.radius, given.colony_ids, reach)
+            cut = cut if weight is None else torch.where(weight >= 1, cut, 1.0)
+            share = torch.minimum(share, cut)
         return share
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchfilm.kernels.bilateral_scheme import NEAR, POINTS_ON_MOVE
 from torchfilm.physics.capsule import rotate
 from torchfilm.physics.surfaces import FlatSurface, Surface
-from torchfilm.tools.reads import rows_where
+from torchfilm.tools.reads import reads_are_free, rows_where
 from torchfilm.tools.vectors import cross, dot, safe_sqrt
 
 # Position (P, d) float64, axis (P, d) and half length (P,) of some capsules.
@@ -125,15 +125,20 @@ def poses_along(position: Tensor, axis: Tensor, length: Tensor, move: Tensor):
     return at
 
 
-@torch.no_grad()
 def share_to_walls(
-    surfaces: Sequence[Surface], at: Callable[[float], Pose], radius: Tensor, colony_id: Tensor
+    surfaces: Sequence[Surface],
+    at: Callable[[float], Pose],
+    radius: Tensor,
+    colony_id: Tensor,
+    reach: Tensor,
 ) -> Tensor:
-    """The share of its move after which each cell is at most its radius behind any wall, (P,).
+    """The share of its move after which each cell comes to lie its radius behind a wall, (P,),
+    nearly: of a move that turns, or at a round wall, it is interpolated.
 
-    A cell that was already deeper may stay as deep as it was. The check is needed because a wall
-    that a cell did not touch before the move may have no row in the solve. at: returns, for a share
-    of the move, position (P, d) float64, axis (P, d) and half length (P,).
+    A cell that was deeper gets no deeper. The check is needed because a wall that a cell did not
+    touch before the move may have no row in the solve. at: returns, for a share of the move,
+    position (P, d) float64, axis (P, d) and half length (P,). reach: no point of a cell moves
+    farther, (P,) µm.
     """
 
     def gap(surface: Surface, share: float) -> Tensor:
@@ -150,7 +155,9 @@ def share_to_walls(
     for surface in surfaces:
         places = 1 if isinstance(surface, FlatSurface) or surface.inside else POINTS_ON_MOVE
         before = gap(surface, 0.0)
-        limit = before.clamp(max=0.0) - radius
+        limit = torch.minimum(before, -radius)
+        if reads_are_free(radius.device) and not bool((before - reach < limit).any()):
+            continue
         for k in range(places):
             after = gap(surface, (k + 1) / places)
             through = (after < limit) & (out > k / places)
