@@ -270,7 +270,7 @@ class State:
         rows = {CELL: self.cells, COLONY: self.colonies}
         for name, value in self.fields.items():
             scope = self.declared[name].scope
-            if scope in rows and value.shape[:1] != (rows[scope],):
+            if scope in rows and (not value.dim() or value.size(0) != rows[scope]):
                 raise checks.input_error(
                     f"shape of the field {name!r}",
                     tuple(value.shape),

@@ -107,8 +107,8 @@ class BoundMechanics(BoundEffect):
         if one_sided:
             new["contact_alpha"], new["compression"] = of_contacts
         of_step = MechanicsReport(**vars(report), substeps=substeps)
-        return state.with_fields(**new).replace(
-            position=x, axis=axes, length=lengths,
+        return state.replace(
+            position=x, axis=axes, length=lengths, fields={**fields, **new},
             reports={**state.reports, "mechanics": of_step},
         )  # fmt: skip
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchfilm.distributions import Uniform
 from torchfilm.resolver import Resolved
 from torchfilm.state import State
-from torchfilm.tools.numba_calls import as_array, column_types, kernels_loaded
+from torchfilm.tools.numba_calls import as_array, column_types, in_numpy, kernels_loaded
 from torchfilm.tools.random import counters
 from torchfilm.tools.tangents import has_tangent, tracked
 
@@ -71,12 +71,11 @@ def due_rows(state: State, size: Tensor | None) -> tuple[Tensor | None, int]:
     see `kernels.divisions.due_rows`. size: (N,), or None where there is no threshold."""
     from torchfilm.kernels import divisions
 
-    fields, none = state.fields, state.length[:0]
-    given = none, none, state.length, state.radius
-    if size is not None:
-        given = size, fields["division_threshold"], state.length, state.radius
+    fields, none = state.fields, np.empty(0, in_numpy(state.dtype))
+    real = lambda x: as_array(x, state.dtype)
+    criterion = (none, none) if size is None else (real(size), real(fields["division_threshold"]))
     flag = as_array(fields["divide_flag"], torch.bool)
-    rows, short = divisions.due_rows(flag, *(as_array(x, state.dtype) for x in given))
+    rows, short = divisions.due_rows(flag, *criterion, real(state.length), real(state.radius))
     return (torch.from_numpy(rows) if len(rows) else None), short
 
 
@@ -119,5 +118,5 @@ def divided(
     )  # fmt: skip
     found = zip(MADE, map(torch.from_numpy, (*of_ids, *of_cells)), strict=True)
     kept = {n: new.pop(n) for n in KEPT}
-    made = state.replace(**dict(found), **kept).with_fields(**new)
+    made = state.replace(**dict(found), **kept, fields={**state.fields, **new})
     return made, torch.from_numpy(daughters)
