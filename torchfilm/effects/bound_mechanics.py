@@ -107,8 +107,8 @@ class BoundMechanics(BoundEffect):
         if one_sided:
             new["contact_alpha"], new["compression"] = of_contacts
         of_step = MechanicsReport(**vars(report), substeps=substeps)
-        return state.replace(
-            position=x, axis=axes, length=lengths, fields={**fields, **new},
+        return state.with_fields(**new).replace(
+            position=x, axis=axes, length=lengths,
             reports={**state.reports, "mechanics": of_step},
         )  # fmt: skip
 

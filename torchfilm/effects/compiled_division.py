@@ -118,5 +118,5 @@ def divided(
     )  # fmt: skip
     found = zip(MADE, map(torch.from_numpy, (*of_ids, *of_cells)), strict=True)
     kept = {n: new.pop(n) for n in KEPT}
-    made = state.replace(**dict(found), **kept, fields={**state.fields, **new})
+    made = state.replace(**dict(found), **kept).with_fields(**new)
     return made, torch.from_numpy(daughters)
