@@ -11,7 +11,7 @@ from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.moves import MOVE, carry_out
 from torchfilm.kernels.rows import degrees
 from torchfilm.kernels.scheme import MAX_TURN
-from torchfilm.kernels.wall_moves import share_to_wall
+from torchfilm.kernels.wall_moves import reach_of, share_to_wall
 
 
 @kernel
@@ -23,21 +23,18 @@ def make_moves(x, axis, length, radius, y, scale, base, kinds, places, sizes, cl
     d = 2 if D == 4 else 3
     scratch, count = np.empty((3, D)), 0
     for i in range(x.shape[0]):
-        way = turn = 0.0
+        turn = 0.0
         for k in range(D):
             scratch[MOVE, k] = y[i, k] * scale[i, k]
-        for k in range(d):
-            way += scratch[MOVE, k] * scratch[MOVE, k]
         for k in range(d, D - 1):
             turn += scratch[MOVE, k] * scratch[MOVE, k]
-        way, turn = math.sqrt(way), math.sqrt(turn)
+        turn = math.sqrt(turn)
         share = MAX_TURN / turn if turn > MAX_TURN else 1.0
-        reach = way + 0.5 * turn * length[i] + 0.5 * max(scratch[MOVE, D - 1], 0.0)
         for k in range(D):
             scratch[MOVE, k] *= share
-        part = 1.0
+        part, ways = 1.0, (share * turn, reach_of(scratch, share * turn, length[i], dof))
         for w in range(kinds.shape[0]):
-            wall, ways = (kinds[w], places[w], sizes[w]), (share * turn, share * reach)
+            wall = kinds[w], places[w], sizes[w]
             part = min(part, share_to_wall(
                 *wall, x, axis, i, length[i], radius[i], scratch, *ways, dof
             ))  # fmt: skip

@@ -50,19 +50,30 @@ def share_to_wall(kind, place, size, x, axis, i, length, radius, scratch, turn, 
     """The share of its move after which cell i, no point of which moves farther than `reach`, µm,
     comes to lie its radius behind a wall, nearly; one that was deeper gets no deeper. A wall that
     it did not touch may have no row in the solve."""
-    out, points = 1.0, POINTS_ON_MOVE if kind == OUTSIDE else 1
+    points = POINTS_ON_MOVE if kind == OUTSIDE else 1
     before = _depth(kind, place, size, x, i, axis, i, 0.5 * length, radius, dof)
     limit = min(before, -radius)
     if before - reach >= limit:
-        return out
+        return 1.0
     for k in range(points):
         after = _depth_after(
             kind, place, size, x, axis, i, length, radius, scratch, (k + 1) / points, turn, dof
         )
-        if after < limit and out > k / points:
-            out = min(out, (k + (before - limit) / (before - after)) / points)
+        if after < limit:
+            return (k + (before - limit) / (before - after)) / points
         before = after
-    return out
+    return 1.0
+
+
+@lean
+def reach_of(scratch, angle, length, dof):
+    """How far the points of a cell may move, at most, µm, by scratch[MOVE], in which it turns by
+    `angle`."""
+    way = 0.0
+    for k in range(2 if len(dof) == 4 else 3):
+        way += scratch[MOVE, k] * scratch[MOVE, k]
+    longer = max(scratch[MOVE, degrees(dof) - 1], 0.0)
+    return math.sqrt(way) + 0.5 * angle * length + 0.5 * longer
 
 
 @lean
@@ -93,10 +104,7 @@ def move_cells(x, axis, length, radius, y, scale, about, bound, least, walls, sc
 def _share_to_hard_walls(x, axis, i, length, radius, scratch, angle, walls, dof):
     """The share of cell i's move that no hard wall cuts off."""
     kinds, places, sizes, is_soft, weights = walls
-    way, part, end = 0.0, 1.0, degrees(dof) - 1
-    for k in range(2 if len(dof) == 4 else 3):
-        way += scratch[MOVE, k] * scratch[MOVE, k]
-    reach = math.sqrt(way) + 0.5 * angle * length + 0.5 * max(scratch[MOVE, end], 0.0)
+    part, reach = 1.0, reach_of(scratch, angle, length, dof)
     for w in range(kinds.shape[0]):
         if not is_soft[w] and weights[w, i] >= 1.0:
             wall = kinds[w], places[w], sizes[w]

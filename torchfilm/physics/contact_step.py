@@ -32,7 +32,7 @@ from torchfilm.physics.contacts import CandidateContacts, Contacts, contacts_of
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.problem import NOT_FINITE, ContactProblem, SolveReport
 from torchfilm.physics.solve import solve_contacts
-from torchfilm.physics.wall_contacts import WallContacts, poses_along, share_to_walls
+from torchfilm.physics.wall_contacts import WallContacts, poses_along, reach_of, share_to_walls
 from torchfilm.tools.reads import known_rows_where, numbers, rows_where
 
 
@@ -181,10 +181,9 @@ def _share(cells: CellProperties, at: Moved, move: Tensor) -> tuple[Tensor, Tens
     contacts mean nothing, and then takes part in the next pass; and it comes no farther than its
     radius behind a wall that it may not have touched before.
     """
-    dim, radius = cells.settings.dim, cells.radius
-    turn, way = (x.square().sum(1).sqrt() for x in (move[:, dim:-1], move[:, :dim]))
+    radius = cells.radius
+    turn, reach = reach_of(at.length, move)
     share = (MAX_TURN / turn).clamp(max=1.0)
-    reach = way + 0.5 * turn * at.length + 0.5 * move[:, -1].clamp(min=0.0)
     placed = poses_along(at.position, at.axis, at.length, share.unsqueeze(1) * move)
     cut = share_to_walls(cells.surfaces, placed, radius, cells.colony_ids, share * reach)
     return reach, share * cut

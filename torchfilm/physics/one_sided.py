@@ -38,6 +38,7 @@ from torchfilm.physics.wall_contacts import (
     WallContacts,
     find_wall_contacts,
     poses_along,
+    reach_of,
     share_to_walls,
 )
 from torchfilm.tools.ragged import marked
@@ -363,10 +364,10 @@ class _OneStep:
 
     def _share_to_hard_walls(self, at, made: Tensor) -> Tensor:
         """The share of each move (N, D) that no hard wall cuts off, (N,)."""
-        given, dim, move = self.given, self.dim, made.detach()
-        share = torch.ones_like(given.radius)
-        way, angle = (x.square().sum(1).sqrt() for x in (move[:, :dim], move[:, dim:-1]))
-        reach = way + 0.5 * angle * at.length.detach() + 0.5 * move[:, -1].clamp(min=0.0)
+        given, share = self.given, torch.ones_like(self.given.radius)
+        if not given.surfaces:
+            return share
+        _, reach = reach_of(at.length.detach(), made.detach())
         placed = poses_along(at.position, at.axis, at.length, made)
         for surface, (kind, weight) in zip(given.surfaces, given.walls, strict=True):
             if kind == "stiffness":

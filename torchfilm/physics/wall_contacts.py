@@ -111,6 +111,14 @@ def _contact_candidates(
     ]
 
 
+def reach_of(length: Tensor, move: Tensor) -> tuple[Tensor, Tensor]:
+    """By which angle cells turn in their moves (N, D), and how far their points may move, at most,
+    µm, (N,) each."""
+    dim = 2 if move.shape[1] == 4 else 3
+    way, turn = (x.square().sum(1).sqrt() for x in (move[:, :dim], move[:, dim:-1]))
+    return turn, way + 0.5 * turn * length + 0.5 * move[:, -1].clamp(min=0.0)
+
+
 def poses_along(position: Tensor, axis: Tensor, length: Tensor, move: Tensor):
     """Poses of cells after a share of their moves (N, D), as `share_to_walls` takes them."""
     dim = position.shape[1]
