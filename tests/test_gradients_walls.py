@@ -101,3 +101,23 @@ def test_place_of_a_wall_that_cuts_a_move():
     found = (up.position[:, 1] - down.position[:, 1]) / 2e-6
     assert float(slopes[cut]) == pytest.approx(1.0, abs=1e-6)
     assert torch.allclose(slopes, found, atol=1e-5)
+
+
+@pytest.mark.parametrize("contacts", ["one-sided", "bilateral"])
+def test_where_a_turn_is_cut_short(contacts):
+    """Cells across one another turn by more than the 0.5 rad of a pass."""
+    rng, cut = np.random.default_rng(11), []
+    where, way = rng.uniform(-0.6, 0.6, (3, 2)), rng.normal(size=(3, 2))
+    cells = tf.Cells(where, way, rng.uniform(0.3, 2.0, 3), 0.5)
+
+    def experiment(alpha):
+        effect = tf.Mechanics(
+            dim=2, contacts=contacts, tolerance=1e-10, passes=1, alpha=alpha.reshape(1)
+        )
+        scene = tf.Scene(tf.Growth(rate=1.0), effect, founders=cells)
+        state = run(scene, scene.bind(dtype=torch.float64).start(), steps=1, dt=0.025)
+        cut.append(int(state.reports["mechanics"].clipped))
+        return state
+
+    check(experiment, 0.05)
+    assert min(cut) > 0

@@ -130,6 +130,53 @@ def test_case_43_a_closed_chamber_stalls_and_nothing_is_thrown_when_it_opens(mea
         before = after
 
 
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_case_43_between_two_walls_a_cell_overlaps_as_wanted_at_any_drag(measured, backend):
+    """The force that stops growth is γ Δl, whatever μ is: 0.014 radii, within 5 %, in one pass."""
+    drags = {"length_drag": [10.0, 1e5, 1e6, 1e6, 1e6], "viscosity": [1.0, 1.0, 100.0, 1.0, 0.01]}
+    walls = [tf.Plane(x=-1.5, facing="+x"), tf.Plane(x=1.5, facing="-x")]
+    given = {name: tf.PerColony(values) for name, values in drags.items()}
+    effect = tf.Mechanics(walls, dim=2, backend=backend, **given)
+    scene = tf.Scene(tf.Growth(rate=1.0), effect, founders=tf.Cells.single(2))
+    *_, state = tf.simulate(scene, until=1.5, colonies=5)
+    off = tf.measure.overlaps(state, walls).walls / (0.014 * 0.5) - 1.0
+    assert state.reports["mechanics"].passes.tolist() == [1] * 5
+    assert measured("overlap over what is wanted, less 1", float(off.abs().max()), "≤ 0.05") <= 0.05
+
+
+@pytest.mark.slow
+def test_case_43_full_chambers_hold_at_any_drag(measured):
+    """The bounds of a closed chamber hold at γ = 10⁶, where μ is 0.01 and where it is 100, too."""
+    count, drag, viscosity = 4, [1e4, 1e6, 1e6, 1e6], [1.0, 1.0, 0.01, 100.0]
+    walls = [tf.Box((-3.0, -10.0), (3.0, 10.0))]
+    given = {"length_drag": tf.PerColony(drag), "viscosity": tf.PerColony(viscosity)}
+    scene = colony(tf.Mechanics(walls, dim=2, **given))
+    mean, worst = [], []
+    for state in tf.simulate(scene, until=9.0, colonies=count, seed=1):
+        if state.time > 6.0:
+            overlap = tf.measure.overlaps(state, walls)
+            mean.append(float(overlap.mean.max()))
+            worst.append(float(torch.maximum(overlap.worst, overlap.walls).max()))
+    assert int(state.counts.min()) > 25
+    assert measured("mean overlap, µm", max(mean), "≤ 0.02") <= 0.02
+    assert measured("worst overlap, µm", max(worst), "≤ 0.1") <= 0.1
+
+
+@pytest.mark.slow
+def test_case_43_a_flat_channel_fills_in_one_pass_a_step(measured):
+    """Channels little higher than a cell is wide, in space: repeated passes do not part cells that
+    α makes too soft."""
+    for height in (1.0, 1.2):
+        walls = [tf.Channel(4.0, height=height, low_end=-6.0, high_end=6.0)]
+        passes, worst = [], 0.0
+        scene = colony(tf.Mechanics(walls, dim=3), dim=3)
+        for state in tf.simulate(scene, until=12.0, colonies=2):
+            passes.append(float(state.reports["mechanics"].passes.double().mean()))
+            worst = max(worst, float(tf.measure.overlaps(state, walls).walls.max()))
+        assert measured("worst overlap with walls, µm", worst, "≤ 0.1") <= 0.1
+        assert measured("passes a step, late", np.mean(passes[-100:]), "≤ 2") <= 2.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("length_drag", [10.0, 1e5])
 def test_case_43_a_full_chamber_stays_as_it_is(measured, length_drag):

@@ -21,8 +21,10 @@ MARGIN, TOO_DEEP, OVERLAP = 0.6, 0.2, 0.014
 BEYOND = 0.5
 # The same in sub-steps: a colony that takes them is not seen between them.
 DEEP_IN_SUBSTEPS = 0.08
-# The most that α μ L may be at that overlap, and the least as a share of it.
-SOFTEST, HARDEST = 0.04, 1e-4
+# The most that α μ L may be at that overlap, and the least as a share of it; less where the force
+# that stops growth, γ Δl, would make more than the share UNMOVED of that overlap. (Drags differ: in
+# a full box with γ = 1e6 and μ = 0.01 cells would lie half their width deep in the walls.)
+SOFTEST, HARDEST, UNMOVED = 0.04, 1e-4, 0.1
 # A pressed cell may lose this part of its growth in a step. Where a cell may lose none, overlaps in
 # closed chambers are twice as deep.
 SHRINK = 0.05

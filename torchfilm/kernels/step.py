@@ -55,6 +55,7 @@ from torchfilm.kernels.scheme import (
     SOFTER,
     SOFTEST,
     TOO_DEEP,
+    UNMOVED,
 )
 from torchfilm.kernels.solve import minimise
 from torchfilm.kernels.solve_parts import overlaps
@@ -165,12 +166,12 @@ def _arrays(memory, length, growth, shortest, last, roots):
 
 
 @lean
-def _prepared(memory, x, axis, growth, radius, viscosity, length_drag, last, first_pass, rising,
-              hardness, softer, walls, alphas, margin, found, arrays, dof):  # fmt: skip
+def _prepared(memory, x, axis, growth, radius, drag, last, first_pass, rising, hardness, softer,
+              walls, alphas, margin, found, arrays, dof):  # fmt: skip
     """Puts what a pass starts from into its arrays. Returns rows of cells at walls, with room for
     those of `found`, how many there are, and the deepest gap."""
     length, least, half, (reach, root), (alpha, low), scale, y, _, _ = arrays
-    drags(length, radius, viscosity, length_drag, growth, scale, dof)
+    drags(length, radius, drag[0], drag[1], growth, scale, dof)
     _put_start(y, last, scale, first_pass, rising)
     _numbers(
         x, length, scale, growth, least, last, first_pass, hardness, softer, walls[4], walls[3],
@@ -181,17 +182,17 @@ def _prepared(memory, x, axis, growth, radius, viscosity, length_drag, last, fir
 
 
 @lean
-def step_colony(memory, x, axis, length, growth, radius, viscosity, length_drag, shortest, last,
-                hardness, walls, alphas, settings, report, team, dof):  # fmt: skip
+def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, hardness, walls,
+                alphas, settings, report, team, dof):  # fmt: skip
     """Grow one colony by `growth` and part what overlaps; x, axis, length, last, hardness in place.
 
     x, axis (n, d) float64. length to shortest: (n,). last: (n, D) the move from which to start.
     hardness: (1,) α. walls: kinds, places, sizes, which are soft, and (S, n) their D, or
     stiffness · Δt. alphas: (n,), or (0,).
     """
-    margin, target, deep, softest, passes = _of_colony(length, growth, radius, viscosity, settings)
+    margin, target, deep, limits, passes = _of_colony(length, growth, radius, drag, settings)
     tolerance, given, is_soft = settings[TOLERANCE], alphas.shape[0] > 0, walls[3]
-    hardness[0] = hardness[0] if hardness[0] > 0 else softest
+    hardness[0] = hardness[0] if hardness[0] > 0 else limits[0]
     arrays = _arrays(memory, length, growth, shortest, last, walls[4])
     half, y, kept = arrays[2], arrays[6], arrays[7]
     number, deeply, softer, rising, held, kept_alpha = 0, False, 1.0, True, 0.0, 0.0
@@ -201,8 +202,8 @@ def step_colony(memory, x, axis, length, growth, radius, viscosity, length_drag,
     while number < passes:
         give_back(memory, top)  # the contacts are kept, not what was made of them
         rows, at_walls, deepest = _prepared(
-            memory, x, axis, growth, radius, viscosity, length_drag, last, number == 0, rising,
-            hardness[0], softer, walls, alphas, margin, found, arrays, dof,
+            memory, x, axis, growth, radius, drag, last, number == 0, rising, hardness[0], softer,
+            walls, alphas, margin, found, arrays, dof,
         )  # fmt: skip
         if number > 0 and not deeply:  # cells do not lie deep in others; but in a wall?
             if deepest >= -deep:
@@ -229,7 +230,7 @@ def step_colony(memory, x, axis, length, growth, radius, viscosity, length_drag,
             break
         if error <= tolerance and number == 0 and not given:
             before = hardness[0]
-            hardness[0] = kept_alpha if failed else _following(e, rows[4], before, target, softest)
+            hardness[0] = kept_alpha if failed else _following(e, rows[4], before, target, limits)
             if hardness[0] < LAG * before and not failed:  # the force has grown: solve again
                 put(y, kept)
                 held, kept_alpha, rising = error, before, False
@@ -304,25 +305,31 @@ def _noted(report, error, tolerance):
 
 
 @lean
-def _of_colony(base, growth, radius, viscosity, settings):
+def _of_colony(base, growth, radius, drag, settings):
     """The margin, the overlap that is wanted, how deep is too deep, all µm, the α of the softest
-    contacts, and the most passes."""
-    wide, drag, n = 0.0, 0.0, base.shape[0]
+    and of the hardest contacts, and the most passes."""
+    viscosity, length_drag = drag
+    wide, across, held, n = 0.0, 0.0, 0.0, base.shape[0]
     for i in range(n):
         wide += radius[i] / n
-        drag += viscosity[i] * (base[i] + growth[i] + 2 * radius[i]) / n
+        across += viscosity[i] * (base[i] + growth[i] + 2 * radius[i]) / n
+        held += length_drag[i] * max(growth[i], 0.0) / n
     deep = settings[DEEP] if settings[DEEP] > 0 else TOO_DEEP * wide
-    softest = SOFTEST * settings[YIELD] / OVERLAP / drag
+    softest = SOFTEST * settings[YIELD] / OVERLAP / across
+    target, hardest = settings[YIELD] * wide, HARDEST * softest
+    if held > 0:
+        hardest = min(hardest, UNMOVED * target / held)
     passes = 1.0 if settings[SOFT] > 0 else settings[MOST_PASSES]
-    return MARGIN * wide, settings[YIELD] * wide, deep, softest, passes
+    return MARGIN * wide, target, deep, (softest, hardest), passes
 
 
 @lean
-def _following(e, soft, hardness, target, softest):
+def _following(e, soft, hardness, target, limits):
     """α at which the mean overlap of the contacts that push, with cells and with hard walls, is
     `target`, µm: harder at once, softer by a factor of two a step. Rows at the ends of stretches do
     not count: they push little, and would make the mean of the others larger."""
     total, count = 0.0, 0
+    softest, hardest = limits
     for r in range(e.shape[0]):
         pushes = (e[r] < 0) & (soft[r] == HARD)
         total -= e[r] if pushes else 0.0  # without branches: their outcome is not foreseen
@@ -332,7 +339,7 @@ def _following(e, soft, hardness, target, softest):
         force = total / count / hardness
         if force > 0:
             wanted = min(wanted, target / force)
-    return max(min(wanted, 2.0 * hardness), HARDEST * softest)
+    return max(min(wanted, 2.0 * hardness), hardest)
 
 
 @lean
@@ -373,7 +380,7 @@ def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, 
             of = spatial_order(memory, x[first:end], 6.0 * radius[first])
             for i in range(end - first):
                 of[i] += first
-            own_x, own_axis, last, roots, length, share, own_radius, viscosity, drag = taken_out(
+            own_x, own_axis, last, roots, length, share, own_radius, mu, gamma = taken_out(
                 memory, of, steps, dt / steps, cells, drags, walls, dof
             )
             shortest = shortest_of(memory, of, length, own_radius, cells)
@@ -385,8 +392,8 @@ def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, 
             for _ in range(steps):
                 give_back(memory, top)
                 step_colony(
-                    memory, own_x, own_axis, length, share, own_radius, viscosity, drag, shortest,
-                    last, hardness, (kinds, places[:, b], sizes[:, b], is_soft, roots), own_alphas,
+                    memory, own_x, own_axis, length, share, own_radius, (mu, gamma), shortest, last,
+                    hardness, (kinds, places[:, b], sizes[:, b], is_soft, roots), own_alphas,
                     own_settings, report, team, dof,
                 )  # fmt: skip
                 if report[STATUS] == NOT_FINITE:

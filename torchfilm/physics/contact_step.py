@@ -34,6 +34,7 @@ from torchfilm.physics.problem import NOT_FINITE, ContactProblem, SolveReport
 from torchfilm.physics.solve import solve_contacts
 from torchfilm.physics.wall_contacts import WallContacts, poses_along, reach_of, share_to_walls
 from torchfilm.tools.reads import known_rows_where, numbers, rows_where
+from torchfilm.tools.vectors import safe_sqrt
 
 
 def contact_step(
@@ -164,17 +165,16 @@ def move_cells(
     dim = cells.settings.dim
     sound = (moving & (solved.status != NOT_FINITE).index_select(0, cells.colony)).unsqueeze(1)
     move = torch.where(sound, move, 0.0)
-    reach, share = _share(cells, at, move.detach())
+    reach, share = _share(cells, at, move)
     move = move * share.unsqueeze(1)
     position = at.position + move[:, :dim].to(at.position.dtype)
     axis = torch.where(sound, capsule.rotate(at.axis, move[:, dim:-1]), at.axis)
     length = at.length + move[:, -1]
     # unlike a maximum, the whole gradient at a tie
     length = torch.where(length >= base, length, base)
-    return Moved(position, axis, length, share < 1, share * reach, at.first_move)
+    return Moved(position, axis, length, share < 1, share.detach() * reach, at.first_move)
 
 
-@torch.no_grad()
 def _share(cells: CellProperties, at: Moved, move: Tensor) -> tuple[Tensor, Tensor]:
     """How far the surface of each cell would come with the whole of its move, (N,) µm, and which
     share of it the cell makes, (N,): it turns by MAX_TURN at most, beyond which the linearised
@@ -182,8 +182,11 @@ def _share(cells: CellProperties, at: Moved, move: Tensor) -> tuple[Tensor, Tens
     radius behind a wall that it may not have touched before.
     """
     radius = cells.radius
-    turn, reach = reach_of(at.length, move)
-    share = (MAX_TURN / turn).clamp(max=1.0)
+    turn = safe_sqrt(move[:, cells.settings.dim : -1].square().sum(1))
+    _, reach = reach_of(at.length.detach(), move.detach())
+    too_far = turn > MAX_TURN
+    share = torch.where(too_far, MAX_TURN / torch.where(too_far, turn, 1.0), 1.0)
     placed = poses_along(at.position, at.axis, at.length, share.unsqueeze(1) * move)
-    cut = share_to_walls(cells.surfaces, placed, radius, cells.colony_ids, share * reach)
+    within = share.detach() * reach
+    cut = share_to_walls(cells.surfaces, placed, radius, cells.colony_ids, within)
     return reach, share * cut

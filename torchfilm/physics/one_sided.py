@@ -23,6 +23,7 @@ from torchfilm.kernels.scheme import (
     SOFTER,
     SOFTEST,
     TOO_DEEP,
+    UNMOVED,
 )
 from torchfilm.physics import capsule
 from torchfilm.physics.adjoint import attach_gradient
@@ -73,6 +74,9 @@ class _OneStep:
         self.target = yielding * self.wide
         whole = length + growth + 2 * given.radius
         self.softest = SOFTEST * yielding / OVERLAP / mean(given.viscosity * whole)
+        held = mean(given.length_drag * growth.clamp(min=0.0))
+        least = torch.where(held > 0, UNMOVED * self.target / held, torch.inf)
+        self.hardest = torch.minimum(HARDEST * self.softest, least)
         with torch.no_grad():
             overlap = given.settings.overlap
             self.deep = (
@@ -327,7 +331,7 @@ class _OneStep:
         force = total[:, 0] / total[:, 1].clamp(min=1) / hardness
         wanted = self.target / torch.where(force > 0, force, 1.0)
         wanted = torch.where(force > 0, torch.minimum(wanted, self.softest), self.softest)
-        return torch.maximum(torch.minimum(wanted, 2 * hardness), HARDEST * self.softest)
+        return torch.maximum(torch.minimum(wanted, 2 * hardness), self.hardest)
 
     def _moved(self, at, move, about, moving, least, number: int) -> StepResult:
         """Carry out the moves (N, D) of the moving cells: the translation at most MARGIN radii from
