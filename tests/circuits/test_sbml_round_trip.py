@@ -84,7 +84,8 @@ def test_what_is_written_is_valid(name, tmp_path):
 def _leaves(circuit):
     graph = circuit.graph
     read_by = [n for names in graph.reads.values() for n in names]
-    return dict.fromkeys([*read_by, *graph.species])
+    both = [f"p.{n}" for n in graph.species if n in graph.parameters]
+    return dict.fromkeys([*read_by, *graph.species, *both])
 
 
 def test_numbers_take_the_place_of_values_per_colony(tmp_path):

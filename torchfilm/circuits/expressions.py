@@ -9,6 +9,7 @@ from dataclasses import dataclass
 NUMBER, NAME = "number", "name"
 COMPARISONS = ("gt", "ge", "lt", "le", "eq", "ne")
 LOGICAL = (*COMPARISONS, "and", "or", "not")
+QUIET = ("cast32", "cast64", "full32", "full64", "detach")  # operations on the type of a number
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -197,10 +198,21 @@ def _of_power(b: Builder, y: Expression, u: Expression, n: Expression):
     return {0: b.simple("mul", n, _less_one(b, u, n)), 1: b.make("mul", y, log)}
 
 
+def may_be_negative(x: Expression) -> bool:
+    """Whether the argument of a law may lie below 0, as far as its form tells; concentrations do
+    not, constants may."""
+    if x.op in (NUMBER, NAME):
+        return x.value < 0 or (x.op == NAME and not x.name.startswith(("u.", "s.")))
+    if x.op in ("add", "mul", "div", "pow", "minimum", "where", *QUIET):
+        return any(map(may_be_negative, x.args[1:] if x.op == "where" else x.args))
+    return x.op not in ("abs", "exp", "sqrt")
+
+
 @_derivative("activation", "repression", "michaelis_menten")
 def _of_hill(b: Builder, y: Expression, x: Expression, half: Expression, *more: Expression):
-    """Of xⁿ/(Kⁿ + xⁿ), or of 1 − that, for x ≥ 0."""
-    n = more[0] if more else b.number(1)
+    """Of xⁿ/(Kⁿ + xⁿ), or of 1 − that, which below 0 are what they are at 0."""
+    n, given = more[0] if more else b.number(1), x
+    x = b.make("maximum", x, 0) if may_be_negative(x) else x
     raised = lambda z: z if n.is_number(1) else b.make("pow", z, n)
     under = b.make("pow", b.make("add", raised(half), raised(x)), 2)
     sign = "neg" if y.op == "repression" else "pos"
@@ -209,6 +221,8 @@ def _of_hill(b: Builder, y: Expression, x: Expression, half: Expression, *more: 
         "div", b.simple("mul", b.simple("mul", n, raised(other)), _less_one(b, z, n)), under
     )
     found = {0: signed(by(x, half), "neg"), 1: signed(by(half, x), "pos")}
+    if x is not given:
+        found[0] = b.make("where", b.make("lt", given, 0), 0, found[0])
     if more:
         both = b.make("div", b.make("mul", raised(half), raised(x)), under)
         log = _log_or_0(b, x, b.make("div", x, half))

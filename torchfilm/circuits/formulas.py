@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from torchfilm.circuits.expressions import NAME, NUMBER, Expression
+from torchfilm.circuits.expressions import NAME, NUMBER, QUIET, Expression, may_be_negative
 
 # How strongly an operation binds; what binds less stands in brackets.
 TRUTH, SUM, SIGN, PRODUCT, POWER, ATOM = range(6)
 SIGNS = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤", "eq": "=", "ne": "≠", "and": "and", "or": "or"}
 TEX_SIGNS = SIGNS | {"ge": r"\ge", "le": r"\le", "ne": r"\ne", "and": r"\wedge", "or": r"\vee"}
-QUIET = ("cast32", "cast64", "full32", "full64", "detach")  # operations on the type of a number
 
 
 def bare(node: Expression) -> Expression:
@@ -101,10 +100,18 @@ class _Plain:
         if op == "pow":
             return self.power(args[0], args[1]), POWER
         if op in ("activation", "repression", "michaelis_menten"):
-            return self.hill(op, *args)
+            return self.hill(op, self._not_below_0(args[0]), *args[1:])
         if op in self.signs:
             return f"{self._in(args[0], SUM)} {self.signs[op]} {self._in(args[1], SUM)}", TRUTH
         return self.call(op, [self.made[a][0] for a in args]), ATOM
+
+    def _not_below_0(self, x: Expression) -> Expression:
+        """What a law takes for its argument."""
+        if not may_be_negative(x):
+            return x
+        cut = Expression("maximum", (x, Expression(NUMBER)))
+        self.made[cut] = self.call("maximum", [self.made[x][0], self.number(0.0)[0]]), ATOM
+        return cut
 
     def _signed(self, first: Expression) -> int:
         """How a product binds that begins with this factor."""

@@ -30,6 +30,7 @@ from torchfilm.tools import checks
 from torchfilm.tools.deterministic_math import deterministic_functions
 
 F64 = torch.float64
+PLACES = 64  # at which sums are looked for
 Kinds = Callable[[str], tuple[torch.dtype, int] | None]
 
 
@@ -179,40 +180,68 @@ class CircuitGraph:
 
     def evaluate(self, values: Mapping[str, Any]) -> dict[str, Tensor]:
         """The rates, and as "out.name" what is released, at values by name: of species and
-        constants by their own names, "out.name" for signals, "cell.volume" and the like."""
-        given = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in values.items()}
-        leaves = {e: e.name for e in walk(self._all()) if e.op == NAME}
-        for leaf in leaves:
-            if text(leaf) not in given:
-                raise checks.InputError(
-                    unknown(f"values lack {text(leaf)!r}", text(leaf), list(given))
-                )
-        found = evaluated(self._all(), lambda leaf: given[text(leaf)])
+        constants by their own names, "out.name" for signals, "cell.volume" and the like. A constant
+        with the name of a species is "p.name"."""
+        given = self._values(values)
+        found = evaluated(self._all(), lambda leaf: given[self._key(leaf)])
         return dict(zip([*self.rates, *(f"out.{n}" for n in self.releases)], found, strict=True))
+
+    def _key(self, leaf: Expression) -> str:
+        """Under which name `evaluate` is given a value."""
+        kind, _, own = leaf.name.partition(".")
+        return leaf.name if kind == "p" and own in self.species else text(leaf)
+
+    def _values(self, values: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Values by name as tensors of one shape. Raises InputError for what is none, or for a name
+        that is lacking or not known."""
+        names = dict.fromkeys(self._key(e) for e in walk(self._all()) if e.op == NAME)
+        given = {}
+        for name, value in values.items():
+            read = (*names, *self.species, *self.parameters)
+            if name not in read and not name.startswith((OUTSIDE, "cell.", "p.")):
+                raise checks.InputError(unknown(f"values have {name!r}", name, list(names)))
+            try:
+                given[name] = torch.as_tensor(value, dtype=torch.float64)
+            except (TypeError, ValueError, RuntimeError) as error:
+                raise checks.input_error(f"values[{name!r}]", value, "numbers") from error
+        for name in names:
+            if name not in given:
+                raise checks.InputError(unknown(f"values lack {name!r}", name, list(given)))
+        try:
+            torch.broadcast_shapes(*(x.shape for x in given.values()))
+        except RuntimeError as error:
+            shapes = ", ".join(f"{n} {tuple(x.shape)}" for n, x in given.items())
+            raise checks.input_error("values", shapes, "of one shape, or single numbers") from error
+        return given
 
     @property
     def conserved(self) -> list[dict[str, int]]:
         """Sums of amounts that never change, as numbers by species and "out.name": found at random
-        concentrations, and checked at others."""
+        values of all names between 0.2 and 2, and checked at others over eight decades. Where rates
+        are not finite at any of them, no sum is found."""
         rows = [*self.rates, *(f"out.{n}" for n in self.releases)]
-        check = self._at_random(1)
+        near, far = self._at_random(0, 0.2, 2.0), self._at_random(1, 1e-4, 1e4)
+        check = np.concatenate([self._at_random(2, 0.2, 2.0), far])
         still = [{n: 1} for n in self.species if n not in self.rates]
         found = []
-        for weights in _null_space(self._at_random(0)):
+        for weights in _null_space(near if len(near) else far):
             parts = check * np.array(weights)
             # relative to what cancels, so that slow reactions count beside fast ones
-            if (np.abs(parts.sum(1)) <= 1e-12 * np.abs(parts).max(1)).all():
+            if len(parts) and (np.abs(parts.sum(1)) <= 1e-12 * np.abs(parts).max(1)).all():
                 found.append({n: w for n, w in zip(rows, weights, strict=True) if w})
         return still + found
 
-    def _at_random(self, seed: int) -> np.ndarray:
-        """Rates at 64 random places, (64, rows), of amounts in a cell of volume 1."""
+    def _at_random(self, seed: int, low: float, high: float) -> np.ndarray:
+        """Rates of amounts in a cell of volume 1 at PLACES random places, all values from low to
+        high, even by their logarithms; (K, rows), of the places where all are finite."""
         rng = np.random.default_rng(seed)
-        names = dict.fromkeys(text(e) for e in walk(self._all()) if e.op == NAME)
-        values = {n: rng.uniform(0.2, 2.0, 64) for n in names} | {"cell.volume": np.ones(64)}
+        names = dict.fromkeys(self._key(e) for e in walk(self._all()) if e.op == NAME)
+        draw = lambda: np.exp(rng.uniform(np.log(low), np.log(high), PLACES))
+        values = {n: draw() for n in names} | {"cell.volume": np.ones(PLACES)}
         found = self.evaluate(values).values()
-        columns = [np.broadcast_to(x.numpy(), (64,)) for x in found]
-        return np.stack(columns, 1) if columns else np.zeros((64, 0))
+        columns = [np.broadcast_to(x.numpy(), (PLACES,)) for x in found]
+        rates = np.stack(columns, 1) if columns else np.zeros((PLACES, 0))
+        return rates[np.isfinite(rates).all(1)]
 
 
 def evaluated(roots: Sequence[Expression], leaf: Callable[[Expression], Tensor]) -> list[Tensor]:
@@ -300,7 +329,7 @@ OPERATIONS: dict[str, Callable[..., Tensor]] = {
 
 def _null_space(rates: np.ndarray) -> list[list[int]]:
     """Whole numbers w with rates @ w = 0, a basis: (K, n) -> vectors of n."""
-    if rates.shape[1] == 0:
+    if rates.size == 0:
         return []
     scale = np.abs(rates).max(0)
     scale[scale == 0] = 1.0
@@ -323,7 +352,7 @@ def _null_space(rates: np.ndarray) -> list[list[int]]:
     basis = basis * (scale[done].reshape(-1, 1) / scale)
     found = []
     for row in basis:
-        shares = [Fraction(float(x)).limit_denominator(24) for x in row]
+        shares = [Fraction(float(x)).limit_denominator(1000) for x in row]
         least = np.lcm.reduce([s.denominator for s in shares])
         whole = [int(s * int(least)) for s in shares]
         common = np.gcd.reduce(whole)
@@ -352,8 +381,17 @@ def graph_of(
         inside, outside = traced_rates(part, own, species)
     except UnknownName as error:
         raise UnknownName(f"{label}: {error}") from error
-    as_expression = lambda x: x.expression if type(x) is Column else builder.number(float(x))
-    of_names = lambda found: {n: as_expression(x) for n, x in found.items()}
+
+    def as_expression(name: str, x: Any) -> Expression:
+        if type(x) is Column:
+            return x.expression
+        try:
+            return builder.number(float(x))
+        except (TypeError, ValueError) as error:
+            what = f"{label}: the rate of {name!r}"
+            raise checks.input_error(what, x, "a column or a number") from error
+
+    of_names = lambda found: {n: as_expression(n, x) for n, x in found.items()}
     for found in (inside, outside):
         check_returned(found, label)
     for name in inside:

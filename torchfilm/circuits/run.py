@@ -359,14 +359,20 @@ def words(
         if code >= MOLECULES:
             reaction = circuit.part.reactions[code - MOLECULES]
             return (
-                f"the reaction {reaction.name or str(reaction)!r} has a"
-                f" {stochastic.STATUS[stochastic.BAD_PROPENSITY].removeprefix('a ')}"
+                f"the reaction {reaction.name or str(reaction)!r} has"
+                " a propensity that is negative or not a finite number"
             )
         return stochastic.STATUS[code]
     if code == rosenbrock.BELOW_ZERO:
         start, one = circuit.start(concentrations), torch.tensor([k], device=concentrations.device)
         slope = circuit.rates(start.index_select(0, one), one)[0]
         names = (*circuit.species, *(f"out.{n}" for n in circuit.exchanged))
+        if not bool((slope[: len(names)] < 0).any()):
+            most = int((slope[: len(names)] / start[k, : len(names)].clamp(min=1e-30)).argmax())
+            return (
+                f"{names[most]!r} grows so fast, from {float(start[k, most]):g} at a rate of"
+                f" {float(slope[most]):g}/h and ever faster, that a step overshoots below zero"
+            )
         first = int(torch.where(slope < 0, start[k] / -slope, torch.inf)[: len(names)].argmin())
         hint = ". Take more steps, or method='rosenbrock'" if method != "rosenbrock" else ""
         return (
