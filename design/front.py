@@ -16,8 +16,10 @@ from design.front_plot import draw_front
 from design.objective import Objective
 from design.parameters import Value, right_aligned, show_value
 from design.pareto import nondominated, spread
+from design.report import at_bound, cells_in
 from design.study import Study
-from design.targets.goals import Goals
+from design.targets.goals import Constrained, Goals, in_words
+from design.trivial import trivial_losses
 from torchfilm import displays
 
 
@@ -89,8 +91,36 @@ class Front:
         return spent, np.array(found)
 
     def table(self) -> str:
-        """The goals and the parameters of each design."""
-        return "\n".join([*right_aligned(self._rows()), self._where()])
+        """The goals and the parameters of each design; which lie at a bound; what colonies without
+        a pattern would have; and what the search took. It grows the designs at both ends again."""
+        return "\n".join([*right_aligned(self._rows()), self._where(), *self._remarks()])
+
+    def _remarks(self) -> list[str]:
+        """What to know of the designs, and of the search."""
+        task, study, lines = self.search.objective.task, self.search.study, []
+        if task.target.bounds and self.goals.min() >= Constrained.BROKEN / self._seeds:
+            bounds = in_words(task.target.bounds)
+            lines.append(f"no design meets the constraints ({bounds}): these miss them by least.")
+        for p in task.space.parameters:
+            there = [str(k) for k, v in enumerate(self.values) if at_bound(p, v[p.name])]
+            if there:
+                lines.append(f"{p.name} at a bound: design {', '.join(there)}")
+        ends = self[0].colonies() + (self[len(self) - 1].colonies() if len(self) > 1 else [])
+        lines.append(f"cells: {cells_in(ends)}")
+        for title, part in zip(self.titles, task.target.parts, strict=True):
+            if part.names and part.pattern and not part.bounds:
+                found = trivial_losses(part, self[0].colonies())
+                each = ", ".join(f"{name} {loss:.3f}" for name, loss in found.items())
+                lines.append(f"{title} without a pattern: {each}")
+        for reason, times in study.failures()[:1]:
+            lines.append(f"most frequent failure: {reason} ({times} colonies)")
+        failed = f", {study.failed} failed" if study.failed else ""
+        spent = f"{study.colonies:.0f} colonies in {study.time}{failed}"
+        return [*lines, f"{spent}; {study.about.get('method', '')}".rstrip("; ")]
+
+    @property
+    def _seeds(self) -> int:
+        return self.seeds or self.search.objective.task.replicates
 
     def _repr_html_(self) -> str:
         head, *rows = self._rows()
@@ -106,7 +136,7 @@ class Front:
 
     def _where(self) -> str:
         where = f"on {self.seeds} fresh seeds" if self.seeds else "on the seeds of the search"
-        return f"{len(self)} designs, {where}"
+        return f"{displays.counted(len(self), 'design', 'designs')}, {where}"
 
     def __repr__(self) -> str:
         return f"Front({', '.join(self.titles)}; {self._where()})"

@@ -30,8 +30,8 @@ def draw_front(
     grid = figure.add_gridspec(2, columns, height_ratios=[1.0, 0.8])
     ax = figure.add_subplot(grid[0, : max(1, (2 * columns) // 3)])
     ax.plot(every[:, 0], every[:, 1], ".", color="0.75", ms=3, label="every design")
-    # no design lies between two neighbours: a step, not a slope
-    ax.step(front[:, 0], front[:, 1], where="post", color="C3", lw=0.8, zorder=1)
+    if front.shape[1] == 2:  # no design lies between two neighbours: a step, not a slope
+        ax.step(front[:, 0], front[:, 1], where="post", color="C3", lw=0.8, zorder=1)
     ax.plot(front[:, 0], front[:, 1], "D", color="C3", ms=4, label="front")
     for row in colonies:
         ax.annotate(
@@ -47,11 +47,12 @@ def draw_front(
         room = 0.6 * (high - low) or 0.1 * abs(high) or 0.1
         set_limits(low - 0.15 * room, high + room)
     ax.set(xlabel=titles[0], ylabel=titles[1])
-    ax.set_title("goals: lower is better", fontsize=9)
+    more = f"; not shown: {', '.join(titles[2:])}" if len(titles) > 2 else ""
+    ax.set_title(f"goals: lower is better{more}", fontsize=9)
     ax.legend(fontsize=7)
     right = figure.add_subplot(grid[0, max(1, (2 * columns) // 3) :])
-    right.plot(*course, color="C3")
-    right.set(xlabel="colonies simulated", ylabel="hypervolume", ylim=(0, None))
+    right.plot(*course, ".-", color="C3")
+    right.set(xlabel="colonies simulated", ylabel="hypervolume", ylim=(0, 1.05 * course[1].max()))
     report_plot.draw_colonies(
         [figure.add_subplot(grid[1, k]) for k in range(len(colonies))],
         target,

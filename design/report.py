@@ -13,10 +13,10 @@ from design.growing import FinishedColonies
 from design.parameters import Choice, Parameter, Space, Value, show_value
 from design.study import Study
 from design.targets.base import Target
-from design.targets.goals import Goals
+from design.targets.goals import Constrained, Goals
 from design.targets.observed import Observed
 from design.task import Task
-from design.trivial import trivial_losses
+from design.trivial import EVERY_SECOND, trivial_losses
 
 WORST = 3  # statistics that a poor fit names
 LUCKY = 0.8  # of the band on fresh seeds: a search that saw less than this was misled
@@ -61,7 +61,7 @@ def table(report: SearchReport) -> str:
     if best.fresh is not None:
         title, loss = f"{_loss_title(report)} on fresh seeds", f"{best.fresh.loss:.4f}"
         rows.append((title, "", "", loss, _seeds(best.fresh)))
-    rows.append(("cells", "", *(_cells(design.colonies) for design in (first, best)), ""))
+    rows.append(("cells", "", *(cells_in(design.colonies) for design in (first, best)), ""))
     target = report.task.target
     old, new = (each_measured(target, design.colonies) for design in (first, best))
     seen = {name: f"{value:.4g} ± {by:.2g}" for name, (value, by) in target.evidence.items()}
@@ -70,7 +70,7 @@ def table(report: SearchReport) -> str:
         rows[0] = (*rows[0][:5], "observed")
     for name in new:
         means = (show_value(_mean(values)) for values in (old.get(name, []), new[name]))
-        row = (name, "", *means, _spread(new[name]))
+        row = (name, target.bounds.get(name, ""), *means, _spread(new[name]))
         rows.append((*row, seen.get(name, "")) if seen else row)
     wide = [max(len(r[k]) for r in rows) for k in range(len(rows[0]))]
     lines = [
@@ -110,7 +110,7 @@ def parameter_rows(
             _bounds(p),
             show_value(first[p.name]),
             show_value(best[p.name]),
-            _at_bound(p, best[p.name]),
+            at_bound(p, best[p.name]),
         )
         for p in space.parameters
     ]
@@ -151,9 +151,11 @@ def _warnings(report: SearchReport) -> list[str]:
     """The losses of trivial answers, and what they and the bounds say of the best design."""
     best, space, target = report.best, report.task.space, report.task.target
     answers, lines = trivial_answers(report), []
+    if missed := _missed(report):
+        lines, answers = [missed], {}
     if answers:
         lines = ["without a pattern: " + ", ".join(f"{n} {x:.3f}" for n, x in answers.items())]
-    least = min(answers, key=lambda n: answers[n], default="")
+    least = best_trivial(target, answers)
     loss = best.loss if best.fresh is None else best.fresh.loss  # that of the search is luck, too
     if least and loss >= answers[least]:
         lines.append(f"the best design is no better than {least!r}: it has found no pattern.")
@@ -171,10 +173,31 @@ def _warnings(report: SearchReport) -> list[str]:
             f" {best.fresh.loss:.4f} on fresh ones. Such losses mislead a search; give it more"
             " replicates."
         )
-    bound = [p.name for p in space.parameters if _at_bound(p, best.values[p.name])]
+    bound = [p.name for p in space.parameters if at_bound(p, best.values[p.name])]
     if bound:
         lines.append(f"at a bound: {', '.join(bound)}; better values may lie beyond it.")
     return lines
+
+
+def best_trivial(target: Target, answers: Mapping[str, float]) -> str:
+    """The trivial answer with the lowest loss; "" where there is none. Where it does not matter
+    which cells are lit, every second one lit is not trivial."""
+    rivals = [n for n in answers if not (target.anywhere and n == EVERY_SECOND)]
+    return min(rivals, key=lambda n: answers[n], default="")
+
+
+def _missed(report: SearchReport) -> str:
+    """Which constraints colonies of the best design break."""
+    target, best = report.task.target, report.best
+    losses = [best.loss * report.task.replicates] if best.fresh is None else best.fresh.losses
+    if not target.bounds or np.sum(losses) < Constrained.BROKEN:
+        return ""
+    found = measured(target, best.colonies)
+    each = ", ".join(f"{n} {b}: it has {show_value(found[n])}" for n, b in target.bounds.items())
+    return (
+        f"the best design misses the constraints in some colonies ({each} in the mean). Simulate"
+        " more colonies, free more parameters, or loosen the constraints."
+    )
 
 
 def trivial_answers(report: SearchReport) -> dict[str, float]:
@@ -203,7 +226,7 @@ def _poor_fit(target: Observed, best: ReportedDesign) -> str:
     )
 
 
-def _at_bound(parameter: Parameter | Choice, value: Value) -> str:
+def at_bound(parameter: Parameter | Choice, value: Value) -> str:
     """Where a number lies on a bound of its own: within NEAR of its range."""
     if isinstance(parameter, Choice) or parameter.whole:
         return ""
@@ -213,7 +236,7 @@ def _at_bound(parameter: Parameter | Choice, value: Value) -> str:
     )
 
 
-def _cells(finished: list[FinishedColonies]) -> str:
+def cells_in(finished: list[FinishedColonies]) -> str:
     """The numbers of cells of some colonies."""
     counts = [n for part in finished for n in part.state.counts.tolist()]
     if not counts:

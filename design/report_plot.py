@@ -12,7 +12,7 @@ import numpy as np
 import torchfilm as tf
 from design.growing import FinishedColonies
 from design.parameters import Parameter, show_value
-from design.report import SearchReport, trivial_answers
+from design.report import SearchReport, best_trivial, trivial_answers
 from design.targets.base import Target
 
 if TYPE_CHECKING:
@@ -165,7 +165,7 @@ def _draw_convergence(ax: Axes, report: SearchReport) -> None:
     ax.plot([0.0], [report.first.loss], "o", color="0.55", clip_on=False)  # as among parameters
     answers = trivial_answers(report)
     if answers:
-        name = min(answers, key=lambda n: answers[n])
+        name = best_trivial(report.task.target, answers)
         ax.axhline(answers[name], color="0.3", lw=0.8, ls="--")
         ax.annotate(
             f"without a pattern: {name}", (1.0, answers[name]), xycoords=("axes fraction", "data"),

@@ -16,6 +16,7 @@ from design.targets.base import OUTSIDE, Target
 from torchfilm import checks
 
 BRIGHT = 1e3  # a lit cell, relative to the greatest level that was found, or to 1
+EVERY_SECOND = "every second lit"
 LEVELS = 25  # even levels that are tried, over six orders of magnitude
 
 
@@ -30,7 +31,7 @@ def trivial_losses(target: Target, finished: Iterable[FinishedColonies]) -> dict
         bright = BRIGHT * max(1.0, *(_greatest(state, n) for n in target.names), 0.0)
         loss = lambda level, state=state, steps=steps: _loss(target, state, steps, level)
         second = lambda count, level=bright: level * (torch.arange(count) % 2)
-        for name, level in (("all dark", 0.0), ("all lit", bright), ("every second lit", second)):
+        for name, level in (("all dark", 0.0), ("all lit", bright), (EVERY_SECOND, second)):
             found.setdefault(name, []).extend(loss(level))
         even.append(np.array([loss(x) for x in np.geomspace(1e-6, 1.0, LEVELS) * bright]))
     answers = {name: float(np.mean(values)) for name, values in found.items()}
@@ -40,10 +41,10 @@ def trivial_losses(target: Target, finished: Iterable[FinishedColonies]) -> dict
 
 
 def check_within_reach(objective: Objective, study: Study) -> bool:
-    """Raise InputError where no colony of full size reaches the target's pattern, so that all
-    designs have the same loss. It looks at the first design that grew; where growth depends on the
-    design, others may reach farther, and nothing is said. Returns whether there was a batch of full
-    size to look at."""
+    """Raise InputError where no colony of full size reaches the pattern of the target, or of one of
+    several, so that all designs have the same loss of it. It looks at the first design that grew;
+    where growth depends on the design, others may reach farther, and nothing is said. Returns
+    whether there was a batch of full size to look at."""
     task = objective.task
     structural = any(p.structural for p in task.space.parameters)
     entry = next((e for e in study.entries if e.size == 1), None)
@@ -51,18 +52,27 @@ def check_within_reach(objective: Objective, study: Study) -> bool:
         return entry is not None
     failed = {row for row, _ in entry.reasons}
     grew = [k for k in range(len(entry.points)) if k not in failed]
-    if not grew or np.ptp(entry.losses[grew]) > 1e-9:
+    patterns = _patterns(task.target)
+    if not grew or (len(patterns) == 1 and np.ptp(entry.losses[grew]) > 1e-9):
         return True
     states = [part.state for part in objective.colonies(entry.points[grew[0]])]
-    if not states or any(bool(task.target.reaches(state).any()) for state in states):
+    within = lambda pattern: any(bool(pattern.reaches(state).any()) for state in states)
+    beyond = next((pattern for pattern in patterns if not within(pattern)), None)
+    if not states or beyond is None:
         return True
     cells = max(int(state.counts.max()) for state in states)
     reach = max(float(state.position.norm(dim=1).max()) for state in states)
     raise checks.InputError(
         f"target: colonies of {cells} cells, which reach {reach:.3g} µm from the origin, do not"
-        f" reach the pattern ({task.target.describe()}), so that all designs have the same loss."
+        f" reach the pattern ({beyond.describe()}), so that all designs have the same loss of it."
         " Grow larger colonies (cells, until), or move the pattern."
     )
+
+
+def _patterns(target: Target) -> list[Target]:
+    """The target, or all of which it is made."""
+    parts = getattr(target, "parts", ())
+    return [found for part in parts for found in _patterns(part)] or [target]
 
 
 def _greatest(state: tf.State, name: str) -> float:

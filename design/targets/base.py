@@ -36,6 +36,8 @@ class Target(metaclass=checks.KnownKeywords):
     fewest: ClassVar[int] = 1  # cells: a smaller colony is not scored
     # whether answers without a pattern, such as evenly lit cells, say what a loss is worth
     pattern: ClassVar[bool] = True
+    # whether it asks how many cells are lit, and not which
+    anywhere: ClassVar[bool] = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -94,6 +96,11 @@ class Target(metaclass=checks.KnownKeywords):
     def mark(self) -> str:
         """What `draw` shows, in words, such as "red lines"; "" where it draws nothing."""
         return ""
+
+    @property
+    def bounds(self) -> dict[str, str]:
+        """The constraints on measures, such as "≥ 10", where the target has some."""
+        return {}
 
     @property
     def evidence(self) -> dict[str, tuple[float, float]]:

@@ -3,9 +3,8 @@ side for a front, and goals that are no patterns."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,10 +12,8 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import Target, ratio, require, species_names, total, valid_levels, weights
+from design.targets.several import Several
 from torchfilm import checks
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 CONCENTRATION = "conc"  # the unit of species
 WORST = 1e4  # the loss of a failed colony where a loss has no upper limit
@@ -80,82 +77,6 @@ class Duration(Target):
         return "soon"
 
 
-class Several(Target):
-    """The base class of targets that are made of others, `parts`: a colony must suit all."""
-
-    parts: tuple[Target, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(name for part in self.parts for name in part.names))
-
-    @property
-    def fewest(self) -> int:  # type: ignore[override]
-        return max(part.fewest for part in self.parts)
-
-    @property
-    def failed(self) -> float:  # type: ignore[override]
-        return sum(part.failed for part in self.parts)
-
-    def check(self, state: tf.State) -> None:
-        for part in self.parts:
-            part.check(state)
-
-    def unfit(self, state: tf.State) -> list[str]:
-        return [
-            next(filter(None, why), "")
-            for why in zip(*(part.unfit(state) for part in self.parts), strict=True)
-        ]
-
-    def note(self, state: tf.State) -> Tensor | None:
-        found = [note for note in (part.note(state) for part in self.parts) if note is not None]
-        return torch.cat(found, 1) if found else None
-
-    def kept(self, state: tf.State) -> float:
-        return sum(part.kept(state) for part in self.parts)
-
-    def _each(
-        self, of: Callable[[Target, Tensor | None], Any], state: tf.State, history: Tensor | None
-    ) -> list[Any]:
-        """Something of every part, with its own columns of the history."""
-        out, at = [], 0
-        for part in self.parts:
-            note = part.note(state)
-            size = 0 if note is None else note.shape[1]
-            own = None if history is None or not size else history[..., at : at + size]
-            out.append(of(part, own))
-            at += size
-        return out
-
-    def losses(self, state: tf.State, history: Tensor | None = None) -> Tensor:
-        """The loss of every part, (B, parts)."""
-        each = self._each(lambda part, own: part.loss(state, own).double(), state, history)
-        return torch.stack(each, 1)
-
-    @property
-    def mark(self) -> str:
-        return "; ".join(dict.fromkeys(part.mark for part in self.parts if part.mark))
-
-    @property
-    def evidence(self) -> dict[str, tuple[float, float]]:
-        return {name: seen for part in self.parts for name, seen in part.evidence.items()}
-
-    def why_undefined(self, measure: str) -> str:
-        # of measures with one name, `measures` has that of the last part
-        each = (part.why_undefined(measure) for part in reversed(self.parts))
-        return next(filter(None, each), "")
-
-    def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
-        each = self._each(lambda part, own: part.measures(state, own), state, history)
-        return {name: value for part in each for name, value in part.items()}
-
-    def reaches(self, state: tf.State) -> Tensor:
-        return torch.stack([part.reaches(state) for part in self.parts]).any(0)
-
-    def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        self._each(lambda part, own: part.draw(ax, state, place, own), state, history)
-
-
 @dataclass(frozen=True)
 class Weighted(Several):
     """The sum of the losses of several targets: `Weighted([(Stripe(…), 1.0), (Burden(), 0.1)])`.
@@ -175,6 +96,13 @@ class Weighted(Several):
         for part, weight in terms:
             checks.number(f"Weighted: the weight of {type(part).__name__}", weight, above=0.0)
             of_colonies("Weighted", part)
+            if isinstance(part, Constrained):
+                raise checks.input_error(
+                    "Weighted: a target",
+                    part.describe(),
+                    "without constraints",
+                    "Put them around the sum: Constrained(Weighted([…]), […], at_least={…}).",
+                )
         object.__setattr__(self, "terms", tuple(terms))
         object.__setattr__(self, "parts", tuple(part for part, _ in terms))
 
@@ -327,22 +255,33 @@ class Constrained(Several):
         return torch.where((missed > 0) & ~own.isnan(), self.BROKEN + share, own)
 
     def remark(self, loss: np.ndarray) -> str:
-        share = float(np.min(loss)) - self.BROKEN
-        if share < 0:
-            return ""
-        miss = f"{100 * share / (1 - share):.3g} %" if share < 1 else "infinity"
-        return (
-            f"no design of the first batch meets the constraints ({self._bounds()}); the nearest"
-            f" misses them by {miss}"
-        )
+        return _nearest(float(np.min(loss)) - self.BROKEN, self.bounds)
 
-    def _bounds(self) -> str:
-        bounds = [f"{n} ≥ {x:g}" for n, x in self.at_least.items()]
-        bounds += [f"{n} ≤ {x:g}" for n, x in self.at_most.items()]
-        return ", ".join(bounds)
+    @property
+    def bounds(self) -> dict[str, str]:
+        least = {n: f"≥ {x:g}" for n, x in self.at_least.items()}
+        most = {n: f"≤ {x:g}" for n, x in self.at_most.items()}
+        return {n: ", ".join(x[n] for x in (least, most) if n in x) for n in least | most}
 
     def describe(self) -> str:
-        return f"{self.target.describe()}, with {self._bounds()}"
+        return f"{self.target.describe()}, with {in_words(self.bounds)}"
+
+
+def in_words(bounds: Mapping[str, str]) -> str:
+    """Constraints by measure, as `Target.bounds` has them."""
+    return ", ".join(f"{name} {bound}" for name, bound in bounds.items())
+
+
+def _nearest(share: float, bounds: Mapping[str, str]) -> str:
+    """By how much the nearest design of a first batch misses its constraints; "" where one holds.
+    share: of the way from `BROKEN` to `BROKEN` + 1."""
+    if share < 0:
+        return ""
+    miss = f"{100 * share / (1 - share):.3g} %" if share < 1 else "infinity"
+    return (
+        f"no design of the first batch meets the constraints ({in_words(bounds)}); the nearest"
+        f" misses them by {miss}"
+    )
 
 
 @dataclass(frozen=True)
@@ -390,7 +329,11 @@ def of_colonies(name: str, part: Target) -> None:
 @dataclass(frozen=True)
 class Goals(Several):
     """Targets side by side, for a front of designs that none exceeds in all. The loss is the sum
-    of theirs."""
+    of theirs.
+
+    A colony that breaks the constraints of one of them has the loss of that in all: so every design
+    that meets the constraints exceeds every one that does not.
+    """
 
     parts: tuple[Target, ...]
 
@@ -413,8 +356,21 @@ class Goals(Several):
             for k, kind in enumerate(kinds)
         )
 
+    def losses(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        found = super().losses(state, history)
+        some = [isinstance(part, Constrained) for part in self.parts]
+        if not any(some):
+            return found
+        worst = found[:, some].amax(1, keepdim=True)
+        return torch.where(worst >= Constrained.BROKEN, worst, found)
+
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         return self.losses(state, history).sum(1)
+
+    def remark(self, loss: np.ndarray) -> str:
+        if not self.bounds:
+            return ""
+        return _nearest(float(np.min(loss)) / len(self.parts) - Constrained.BROKEN, self.bounds)
 
     def describe(self) -> str:
         return "; ".join(part.describe() for part in self.parts)

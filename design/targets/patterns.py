@@ -153,6 +153,7 @@ class OnFraction(Target):
     on or off.
     """
 
+    anywhere = True
     species: str
     fraction: float
     level: float

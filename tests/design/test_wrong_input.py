@@ -154,15 +154,29 @@ def test_a_pattern_beyond_the_colonies_is_refused_after_the_first_batch(method):
             Ring("gfp", 12.0, 4.0, centre=(0.0, 0.0)),
             {"until": 2.0},
         ),
-        (lit, MAKE, Weighted([(Ring("gfp", 2.0, 3.0), 1.0), (RING_BEYOND, 1.0)]), {"cells": 8}),
         (lit, MAKE, Ring("gfp", 5.0, 2.0, edge_width=1.5), {"cells": 8}),
     ],
-    ids=["growth is searched", "one of two", "the edge alone"],
+    ids=["growth is searched", "the edge alone"],
 )
 def test_a_pattern_that_some_colony_may_reach_is_not_refused(scene, parameters, target, options):
     one = Sobol(batch=1)  # all losses of a batch are equal
     found = Search(scene, parameters, target, replicates=1, method=one, finals=None, **options)
     assert found.run(colonies=2).loss <= 2.0
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"target": Weighted([(Ring("gfp", 2.0, 3.0), 1.0), (RING_BEYOND, 1.0)])},
+        {"target": Constrained(Burden(), [RING_BEYOND], at_least={"contrast": 2.0})},
+        {"target": None, "targets": [RING_BEYOND, Burden()]},
+    ],
+    ids=["a sum", "a constraint", "a front"],
+)
+def test_one_pattern_of_several_beyond_the_colonies_is_named(given):
+    """The search would spend its budget on the others."""
+    with pytest.raises(tf.InputError, match=r"the pattern .gfp in a ring of radius 60"):
+        search(cells=8, replicates=2, **given).run(colonies=200, progress=False)
 
 
 def test_a_stripe_beyond_the_colonies_is_refused_again_where_the_search_is_resumed(tmp_path):

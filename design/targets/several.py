@@ -1,0 +1,95 @@
+"""Targets that are made of others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+import torchfilm as tf
+from design.targets.base import Target
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+class Several(Target):
+    """The base class of targets that are made of others, `parts`: a colony must suit all."""
+
+    parts: tuple[Target, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(name for part in self.parts for name in part.names))
+
+    @property
+    def fewest(self) -> int:  # type: ignore[override]
+        return max(part.fewest for part in self.parts)
+
+    @property
+    def failed(self) -> float:  # type: ignore[override]
+        return sum(part.failed for part in self.parts)
+
+    def check(self, state: tf.State) -> None:
+        for part in self.parts:
+            part.check(state)
+
+    def unfit(self, state: tf.State) -> list[str]:
+        return [
+            next(filter(None, why), "")
+            for why in zip(*(part.unfit(state) for part in self.parts), strict=True)
+        ]
+
+    def note(self, state: tf.State) -> Tensor | None:
+        found = [note for note in (part.note(state) for part in self.parts) if note is not None]
+        return torch.cat(found, 1) if found else None
+
+    def kept(self, state: tf.State) -> float:
+        return sum(part.kept(state) for part in self.parts)
+
+    def _each(
+        self, of: Callable[[Target, Tensor | None], Any], state: tf.State, history: Tensor | None
+    ) -> list[Any]:
+        """Something of every part, with its own columns of the history."""
+        out, at = [], 0
+        for part in self.parts:
+            note = part.note(state)
+            size = 0 if note is None else note.shape[1]
+            own = None if history is None or not size else history[..., at : at + size]
+            out.append(of(part, own))
+            at += size
+        return out
+
+    def losses(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        """The loss of every part, (B, parts)."""
+        each = self._each(lambda part, own: part.loss(state, own).double(), state, history)
+        return torch.stack(each, 1)
+
+    @property
+    def mark(self) -> str:
+        return "; ".join(dict.fromkeys(part.mark for part in self.parts if part.mark))
+
+    @property
+    def bounds(self) -> dict[str, str]:
+        return {name: bound for part in self.parts for name, bound in part.bounds.items()}
+
+    @property
+    def evidence(self) -> dict[str, tuple[float, float]]:
+        return {name: seen for part in self.parts for name, seen in part.evidence.items()}
+
+    def why_undefined(self, measure: str) -> str:
+        # of measures with one name, `measures` has that of the last part
+        each = (part.why_undefined(measure) for part in reversed(self.parts))
+        return next(filter(None, each), "")
+
+    def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
+        each = self._each(lambda part, own: part.measures(state, own), state, history)
+        return {name: value for part in each for name, value in part.items()}
+
+    def reaches(self, state: tf.State) -> Tensor:
+        return torch.stack([part.reaches(state) for part in self.parts]).any(0)
+
+    def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
+        self._each(lambda part, own: part.draw(ax, state, place, own), state, history)

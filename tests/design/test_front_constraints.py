@@ -1,0 +1,82 @@
+"""Constraints among several goals, and what the table of a front and of a constrained search
+say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from searching import Level, lit
+
+import torchfilm as tf
+from design import NSGA2, Burden, Constrained, OnFraction, Parameter, Search, Weighted
+
+LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
+
+
+def search(bound, targets=True, **options):
+    """For little burden at a level of at least `bound`."""
+    parts = [Constrained(Level(wanted=1.0), at_least={"mean_level": bound}), Burden()]
+    given = {"targets": parts, "method": NSGA2(population=8)} if targets else {}
+    return Search(lit, LIT, cells=3, replicates=2, **{**given, **options})
+
+
+def test_designs_that_meet_the_constraints_exceed_all_others():
+    """Of goals that disagree: what is dark has least burden, and breaks the constraint."""
+    made = search(0.5)
+    front = made.run(colonies=80, progress=False)
+    every = np.concatenate([goals for _, goals in made.study.full_goals()])
+    broken = every.max(1) >= Constrained.BROKEN / 2
+    assert broken.any() and not broken.all(), "both occur"
+    assert (every[broken].min(1) >= Constrained.BROKEN / 2).all(), "in all goals"
+    assert len(front) > 1 and front.goals.max() < 100
+    assert "meets the constraints" not in front.table()
+
+
+def test_a_front_of_designs_that_meet_none_says_so(capsys):
+    front = search(1e6).run(colonies=40, progress=False)
+    assert "no design of the first batch meets the constraints (mean_level ≥ 1e+06)" in (
+        capsys.readouterr().err
+    )
+    assert "no design meets the constraints (mean_level ≥ 1e+06)" in front.table()
+
+
+def test_the_table_of_a_front_tells_bounds_cells_trivial_answers_and_cost():
+    corners = [{"make": 0.1, "decay": 2.0}, {"make": 10.0, "decay": 0.5}]
+    made = Search(
+        lit, LIT, targets=[OnFraction("gfp", 0.5, level=1.0), Burden()], cells=3, replicates=2,
+        method=NSGA2(population=8), start=corners, finals=None,
+    )  # fmt: skip
+    front = made.run(colonies=40, progress=False)
+    said = front.table()
+    at = [k for k, v in enumerate(front.values) if v["make"] < 0.1001]
+    assert at, "the darkest design is on the front"
+    (line,) = [line for line in said.splitlines() if line.startswith("make at a bound: design ")]
+    assert str(at[0]) in line.removeprefix("make at a bound: design ").split(", ")
+    assert "\ncells: " in said
+    assert "onfraction without a pattern: all dark 1.000" in said
+    assert "40 colonies in" in said and "nsga2(population=8)" in said
+
+
+def test_the_report_names_the_constraints_that_the_best_design_misses():
+    target = Constrained(Burden(), [Level(wanted=1.0)], at_least={"mean_level": 1e6})
+    best = search(0, targets=False, target=target).run(colonies=24, progress=False)
+    said = best.table()
+    assert (
+        "the best design misses the constraints in some colonies (mean_level ≥ 1e+06: it has"
+        in said
+    )
+    assert "the pattern is weak" not in said and "found no pattern" not in said
+    (row,) = [line for line in said.splitlines() if line.startswith("mean_level ")]
+    assert "≥ 1e+06" in row
+
+
+def test_constraints_stand_around_a_sum_and_not_in_it():
+    part = Constrained(Level(), at_least={"mean_level": 1.0})
+    with pytest.raises(tf.InputError, match="Put them around the sum: Constrained"):
+        Weighted([(part, 1.0), (Burden(), 0.1)])
+
+
+def test_every_second_cell_lit_is_no_trivial_answer_to_a_share_of_lit_cells():
+    made = Search(lit, LIT, OnFraction("gfp", 0.5, level=1.0), cells=8, replicates=2)
+    said = made.run(colonies=24, progress=False).table()
+    assert "every second lit 0.0" in said and "'every second lit'" not in said
