@@ -458,3 +458,17 @@ def test_lengths_in_pixels_are_noticed(division, length, pixels):
     assert ("look like pixels" in said) == pixels and "Raise the threshold" in said
     if pixels:
         assert "length 39.6" in said and "multiply" in said
+
+
+def test_a_table_of_results_is_read_back_as_cells(tmp_path):
+    """What it has of the run, of other columns and of the medium is no field of the cells."""
+    scene = tf.scenes.quorum_sensing()
+    *_, state = tf.simulate(scene, cells=6, record=tmp_path / "run.h5")
+    with tf.Results(tmp_path / "run.h5") as results:
+        results.to_pandas(frame=-1).to_csv(tmp_path / "last.csv", index=False)
+    given = {"length_unit": "um", "angle_unit": "radians"}
+    cells = tf.Cells.from_table(tmp_path / "last.csv", **given)
+    assert set(cells.extra) == {"ahl", "division_threshold", "growth_rate", "luxi"}
+    again = scene.bind(cells=cells).start()
+    assert torch.allclose(again.fields["luxi"], state.fields["luxi"])
+    assert torch.allclose(again.length, state.length)

@@ -312,3 +312,13 @@ def test_the_range_of_a_concentration_spans_a_hundredth(values, limits):
     found = scale_of("gfp", seen, PlotStyle(colour="gfp"), {"gfp": "conc"})
     assert found.limits == pytest.approx(limits, rel=1e-6)
     assert found.beyond == "neither"
+
+
+@pytest.mark.parametrize(
+    ("colour", "hint"),
+    [("age", "Tables and ParaView have it"), ("out.ahl", "drawn by background='ahl'")],
+)
+def test_what_only_tables_have_is_not_taken_for_a_slip(colour, hint):
+    *_, state = tf.simulate(tf.scenes.quorum_sensing(), cells=2)
+    with pytest.raises(tf.InputError, match=hint):
+        tf.show(state, colour=colour)

@@ -132,9 +132,9 @@ class EndlessRunWarning:
         if self.warned:
             names = ", ".join(map(str, state.colony_id[still].tolist()[:5]))
             warn(
-                f"colony {names}: no larger than {STILL} steps ago, with fewer than the"
-                f" {self.standstill.cells} cells at which this run ends. It may continue for ever:"
-                " give a time to stop at as well (until=…, --until).",
+                f"colony {names}: larger by less than a hundredth than {STILL} steps ago, with"
+                f" fewer than the {self.standstill.cells} cells at which this run ends. It may"
+                " continue for ever: give a time to stop at as well (until=…, --until).",
                 category=RuntimeWarning,
             )
 

@@ -28,6 +28,7 @@ from torchfilm.cli.threads import use_threads
 from torchfilm.initial_cells import Cells
 from torchfilm.io.recorder import Recorder
 from torchfilm.io.results import Results
+from torchfilm.loop import LOOK, STILL, Standstill
 from torchfilm.model import Model
 from torchfilm.scene import Scene
 from torchfilm.scenes.recipes import from_plain
@@ -38,6 +39,8 @@ from torchfilm.tools.checks import InputError
 from torchfilm.tools.timing import Timings
 from torchfilm.tools.warn_once import warn
 from torchfilm.tuning.settings import Settings, accurate
+
+DEFAULT_CELLS = 500  # at which a run ends, where nobody says so
 
 
 @dataclass
@@ -57,7 +60,7 @@ class Run:
     """Independent colonies in the batch; by default as many as a parameter has values, or 1."""
     cells: int | None = None
     """Stop once every colony has this many cells. Without an end: 500, or the number of the
-    design."""
+    design; and where no colony grows on to 500, such as in a channel that is full."""
     until: float | None = None
     """Stop at this time, h."""
     dt: float | None = None
@@ -105,8 +108,9 @@ class Run:
         cells, until = self.cells, self.until
         if cells is None and until is None:
             cells, until = plan.get("cells"), plan.get("until")
-            if cells is None and until is None:
-                cells = 500
+        unasked = cells is None and until is None
+        if unasked:
+            cells = DEFAULT_CELLS
         double = self.double or plan.get("dtype") == "float64"
         start = self._cells()
         model = scene.bind(
@@ -141,6 +145,7 @@ class Run:
             watch=self.watch,
             picture=self.picture,
             colour=colour,
+            full=Standstill(DEFAULT_CELLS, STILL) if unasked else None,
         )
 
     def _cells(self) -> Cells | None:
@@ -281,8 +286,10 @@ def go(
     watch: bool,
     picture: bool,
     colour: str | None = None,
+    full: Standstill | None = None,
 ) -> None:
-    """Run with a progress bar; then print where the results are, and a summary."""
+    """Run with a progress bar; then print where the results are, and a summary. full: for a run
+    whose end nobody asked for; it also ends where no colony comes nearer to it."""
     sources = [effect.hot_reload for effect in model.effects]
     reloads = [source for source in sources if source is not None]
     if watch and not any(reload.path for reload in reloads):
@@ -306,12 +313,20 @@ def go(
         progress=None,
     )
     with closing(run):
-        for state in run:  # noqa: B007 (the last state is used below)
+        for state in run:
             for reload in reloads:
                 while reload.messages:
                     tqdm.write(reload.messages.pop(0))
             if interrupted.is_set():
                 raise KeyboardInterrupt
+            if full is not None and state.step % LOOK == 0:
+                ended = full(state) | (state.counts >= full.cells) | (state.counts == 0)
+                if bool(ended.all()):
+                    tqdm.write(
+                        f"ended at {state.time:g} h: no colony grows on to {full.cells} cells. For"
+                        " another end give --cells or --until."
+                    )
+                    break
     seconds = time.perf_counter() - begun
     print(f"results  {recorder.path}")
     if picture and state.cells:

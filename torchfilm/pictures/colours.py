@@ -30,6 +30,10 @@ RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 Beyond = Literal["neither", "both", "min", "max"]
 Limits = Mapping[str, tuple[float, float]]
+# What tables have of each cell, and no frame holds.
+NOT_DRAWN = dict.fromkeys(
+    ("age", "born", "volume"), "Tables and ParaView have it (to_pandas, export); pictures do not."
+)
 
 
 @dataclass(frozen=True)
@@ -140,7 +144,10 @@ class PlotStyle:
                 what = "colour" if self.channels is None else "channels"
                 listed = [n for n in known if n not in frame.internal]
                 rule = ("'angle' or " if self.channels is None else "") + "one of "
-                hint = checks.suggestion(name, [ANGLE, *listed])
+                hint = NOT_DRAWN.get(name) or checks.suggestion(name, [ANGLE, *listed])
+                if name.startswith(OUTSIDE):
+                    signal = name.removeprefix(OUTSIDE)
+                    hint = f"What is outside of cells is drawn by background={signal!r}."
                 raise checks.input_error(what, name, rule + ", ".join(listed), hint)
 
 

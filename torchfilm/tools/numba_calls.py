@@ -22,7 +22,7 @@ def unavailable() -> str:
     """Why kernels cannot be compiled here, or "" where they can."""
     try:
         import numba  # noqa: F401
-    except ImportError as error:
+    except (ImportError, OSError) as error:  # or a library of its own cannot be loaded
         reason = f"Numba cannot be imported ({error})"
         warn(
             f"{reason}: torch computes contacts, circuits and exchange, ten times slower or more."
