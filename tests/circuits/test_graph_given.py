@@ -95,12 +95,3 @@ def test_a_constant_with_the_name_of_a_species_has_a_value_of_its_own():
     assert float(graph.evaluate({"k": 3.0, "p.k": 10.0})["k"]) == 4.0
     with pytest.raises(tf.InputError, match=r"values lack 'p\.k'"):
         graph.evaluate({"k": 3.0})
-
-
-@pytest.mark.parametrize("backend", ["compiled", "torch"])
-def test_what_grows_without_bound_is_named(backend):
-    rates = lambda u, s, p, cell: {"b": 0.0 * u.b, "a": 10.0 * u.a**2}
-    circuit = tf.Circuit(rates, species=("b", "a"), initial={"a": 0.7}, backend=backend)
-    with pytest.raises(tf.SimulationError, match="'a' grows so fast, from 23"):
-        for _ in tf.simulate(tf.Scene(tf.Growth(rate=1.0), circuit), dt=0.05, until=1.0):
-            pass

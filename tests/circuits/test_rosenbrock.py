@@ -12,6 +12,7 @@ import torch
 from helpers import array
 from scipy.integrate import solve_ivp
 
+import torchfilm as tf
 from torchfilm.circuits import kinetics, linear
 from torchfilm.circuits.rosenbrock import BELOW_ZERO, DONE, NOT_FINITE, TOO_MANY_STEPS, rodas3
 from torchfilm.tools.deterministic_math import deterministic_functions
@@ -420,7 +421,7 @@ def test_linear_systems(device, dtype, size):
         + size * torch.eye(size, dtype=F64).unsqueeze(2)
     ).to(device=device, dtype=dtype)
     b = torch.rand(size, 9, generator=g, dtype=F64).to(device=device, dtype=dtype)
-    lu, sound = linear.factor(matrix, torch.full_like(b, float(size)))
+    lu, sound, _ = linear.factor(matrix, torch.full_like(b, float(size)))
     assert sound.all()
     whole = matrix.permute(2, 0, 1).double()
     for found, dense in (
@@ -452,3 +453,26 @@ def test_pivots_that_vanish_are_noticed():
     u, report = rodas3(lambda u, rows: 2.0 * u, torch.ones(1, 1, dtype=F64), 1.0)
     assert int(report.status) == DONE and int(report.rejected) > 0
     assert float(u) == pytest.approx(np.exp(2), rel=1e-3)
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+@pytest.mark.parametrize("grows", [False, True])
+def test_what_runs_away_in_a_finite_time_fails_and_is_named(backend, grows):
+    """u' = 10 u² from 0.7 reaches infinity at 0.143 h. An implicit step may leap over that, to
+    numbers that look sound."""
+    rates = lambda u, s, p, cell: {"b": 0.0 * u.b, "a": 10.0 * u.a**2}
+    circuit = tf.Circuit(rates, species=("b", "a"), initial={"a": 0.7}, backend=backend)
+    effects = [tf.Growth(rate=1.0)] if grows else []
+    told = r"step [34] .*\n.*: 'a' runs away, from"
+    with pytest.raises(tf.SimulationError, match=told):
+        for _ in tf.simulate(tf.Scene(*effects, circuit), dt=0.05, until=1.0):
+            pass
+
+
+def test_growth_faster_than_a_step_is_followed():
+    """u' = 100 u in steps of the scene that are five times too long for it: e⁵ in each."""
+    circuit = tf.Circuit(
+        lambda u, s, p, cell: {"a": 100.0 * u.a}, species=("a",), initial={"a": 1e-6}
+    )
+    *_, state = tf.simulate(tf.Scene(circuit), dt=0.05, until=0.2)
+    assert float(state.fields["a"]) == pytest.approx(1e-6 * math.exp(20.0), rel=2e-3)

@@ -316,8 +316,11 @@ def _linear(pattern: Pattern) -> str:
         for k in range(size)
     ]
     lines.append("sound = " + " & ".join(sound))
+    plain = lambda k: (k, k) not in at and not any((k, i) in pattern.filled for i in range(k))
+    signs = [f"_sign(m{k}_{k})" for k in range(size) if not plain(k)]  # the others are w
+    lines.append("leaps = " + (" * ".join(signs) or "w") + " < 0.0")
     entries = as_tuple([f"m{i}_{k}" for i, k in sorted(pattern.filled)])
-    text += _function("factored", "j, w", lines, f"{entries}, sound")
+    text += _function("factored", "j, w", lines, f"{entries}, sound, leaps")
     lines = [f"{entries} = m", f"{as_tuple(x)} = b"]
     for k in range(size):
         lines += [

@@ -18,10 +18,11 @@ from torchfilm.tools.tangents import tracked
 LEAST_PIVOT = 1e-8
 
 
-def factor(matrix: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+def factor(matrix: Tensor, scale: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """L and U of (S, S, M) in one tensor of that shape.
 
-    Also whether (M,) all pivots are safe relative to the diagonal's own `scale` (S, M).
+    Also whether (M,) all pivots are safe relative to the diagonal's own `scale` (S, M), and whether
+    (M,) the determinant is negative.
     """
     lu = matrix.clone()
     size = lu.shape[0]
@@ -29,7 +30,8 @@ def factor(matrix: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
         lu[k + 1 :, k].div_(lu[k, k])
         lu[k + 1 :, k + 1 :].sub_(lu[k + 1 :, k : k + 1] * lu[k : k + 1, k + 1 :])
     pivots = torch.diagonal(lu, dim1=0, dim2=1).t()
-    return lu, (pivots.abs() > LEAST_PIVOT * scale).all(0)
+    odd = (pivots < 0).sum(0) % 2 == 1
+    return lu, (pivots.abs() > LEAST_PIVOT * scale).all(0), odd
 
 
 def substitute(lu: Tensor, b: Tensor) -> Tensor:

@@ -368,11 +368,7 @@ def words(
         slope = circuit.rates(start.index_select(0, one), one)[0]
         names = (*circuit.species, *(f"out.{n}" for n in circuit.exchanged))
         if not bool((slope[: len(names)] < 0).any()):
-            most = int((slope[: len(names)] / start[k, : len(names)].clamp(min=1e-30)).argmax())
-            return (
-                f"{names[most]!r} grows so fast, from {float(start[k, most]):g} at a rate of"
-                f" {float(slope[most]):g}/h and ever faster, that a step overshoots below zero"
-            )
+            return rosenbrock.STATUS[code] + _runaway(circuit, concentrations, k, dt)
         first = int(torch.where(slope < 0, start[k] / -slope, torch.inf)[: len(names)].argmin())
         hint = ". Take more steps, or method='rosenbrock'" if method != "rosenbrock" else ""
         return (
@@ -381,7 +377,7 @@ def words(
         )
     bad = _not_finite(circuit, concentrations, k, dt)
     if code != rosenbrock.NOT_FINITE and not bad:
-        return rosenbrock.STATUS[code]
+        return rosenbrock.STATUS[code] + _runaway(circuit, concentrations, k, dt)
     at = ", ".join(
         f"{n} = {float(x):g}" for n, x in zip(circuit.species, concentrations[k], strict=True)
     )
@@ -392,6 +388,21 @@ def words(
 
 
 @torch.no_grad()
+def _runaway(circuit: CircuitCells, concentrations: Tensor, k: int, dt: float) -> str:
+    """The species of the k-th cell that would more than double in a step, the fastest, if any."""
+    one = torch.tensor([k], device=concentrations.device)
+    start, now = circuit.start(concentrations), concentrations[k]
+    slope = circuit.rates(start.index_select(0, one), one)[0]
+    share = torch.where(now > 0, slope[: len(circuit.species)] / now, 0.0)
+    most = int(share.argmax())
+    if not float(share[most]) * dt > 1:
+        return ""
+    return (
+        f": {circuit.species[most]!r} runs away, from {float(now[most]):g} at a rate of"
+        f" {float(slope[most]):g}/h"
+    )
+
+
 def _not_finite(circuit: CircuitCells, concentrations: Tensor, k: int, dt: float) -> list[str]:
     """The species and signals whose rates in the k-th cell are not finite, at the start of the step
     or further along it: an adaptive method stops before it gets there."""

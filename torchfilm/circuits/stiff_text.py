@@ -18,7 +18,7 @@ CONSTANTS = {
         name: getattr(rosenbrock, name)
         for name in (
             "DONE", "TOO_MANY_STEPS", "NOT_FINITE", "BELOW_ZERO", "SAFETY", "SHRINK", "GROW",
-            "LEAST_STEP", "MAX_NONFINITE_STEPS",
+            "LEAP", "LEAST_STEP", "MAX_NONFINITE_STEPS",
         )
     },
     "LEAST_PIVOT": linear.LEAST_PIVOT,
@@ -77,7 +77,7 @@ def step(u, c, h, rtol, atol, eps, largest):
     {u} = u
     f, j = linearised(u, c)
     p = 1.0 / h
-    m, sound = factored(j, 2.0 * p)
+    m, sound, leaps = factored(j, 2.0 * p)
     {f} = f
     {low_of}
     low = {low}
@@ -93,6 +93,7 @@ def step(u, c, h, rtol, atol, eps, largest):
     {new_of}
     error, size = 0.0, 0.0
     {error_of}
+    error = where(leaps & (error < LEAP), LEAP, error)
     error = where(sound & (size < largest), error, np.nan)
     {noise_of}
     {noisy}

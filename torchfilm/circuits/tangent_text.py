@@ -71,7 +71,7 @@ def step_moved(u, t, c, leaf, turn, h, eps):
     tj = linearised_moved(u, leaf, t, turn)
     tf = rates_moved(u, leaf, t, turn)
     p = 1.0 / h
-    m, _ = factored(j, 2.0 * p)
+    m, _, _ = factored(j, 2.0 * p)
     {f} = f
     {tf} = tf
     {low_of}
