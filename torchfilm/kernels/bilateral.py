@@ -229,8 +229,9 @@ def step_colony(memory, x, axis, base, growth, radius, viscosity, length_drag, a
         if status == NOT_FINITE:
             y[:] = 0
         report[CLIPPED] = make_moves(
-            x, axis, length, radius, y, scale, base, kinds, places, sizes, clipped, dof
-        )
+            x, axis, length, radius, y, scale, base, kinds, places, sizes, roots, is_soft, clipped,
+            dof,
+        )  # fmt: skip
     return length
 
 

@@ -15,9 +15,11 @@ from torchfilm.kernels.wall_moves import reach_of, share_to_wall
 
 
 @kernel
-def make_moves(x, axis, length, radius, y, scale, base, kinds, places, sizes, clipped, dof):
+def make_moves(x, axis, length, radius, y, scale, base, kinds, places, sizes, roots, is_soft,
+               clipped, dof):  # fmt: skip
     """Carry out the scaled move y, in part where a cell would turn by more than MAX_TURN or go
-    through a wall; then y is what was done. Marks the cells that were cut short; returns how many.
+    through a wall; then y is what was done. roots, is_soft: weights of walls, (S, n), and which are
+    soft. Marks the cells that were cut short; returns how many.
     """
     D = degrees(dof)
     d = 2 if D == 4 else 3
@@ -34,7 +36,7 @@ def make_moves(x, axis, length, radius, y, scale, base, kinds, places, sizes, cl
             scratch[MOVE, k] *= share
         part, ways = 1.0, (share * turn, reach_of(scratch, share * turn, length[i], dof))
         for w in range(kinds.shape[0]):
-            wall = kinds[w], places[w], sizes[w]
+            wall = kinds[w], places[w], sizes[w], is_soft[w] > 0 or roots[w, i] < 1.0
             part = min(part, share_to_wall(
                 *wall, x, axis, i, length[i], radius[i], scratch, *ways, dof
             ))  # fmt: skip

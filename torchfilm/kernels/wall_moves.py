@@ -46,13 +46,14 @@ def _depth_after(kind, place, size, x, axis, i, length, radius, scratch, share, 
 
 
 @lean
-def share_to_wall(kind, place, size, x, axis, i, length, radius, scratch, turn, reach, dof):
+def share_to_wall(kind, place, size, gives, x, axis, i, length, radius, scratch, turn, reach, dof):
     """The share of its move after which cell i, no point of which moves farther than `reach`, µm,
-    comes to lie its radius behind a wall, nearly; one that was deeper gets no deeper. A wall that
-    it did not touch may have no row in the solve."""
+    comes to lie its radius behind a wall, nearly; one that was deeper gets no deeper; but in a wall
+    that `gives` it may come deeper by its radius. A wall that it did not touch may have no row in
+    the solve."""
     points = POINTS_ON_MOVE if kind == OUTSIDE else 1
     before = _depth(kind, place, size, x, i, axis, i, 0.5 * length, radius, dof)
-    limit = min(before, -radius)
+    limit = min(before, 0.0) - radius if gives else min(before, -radius)
     if before - reach >= limit:
         return 1.0
     for k in range(points):
@@ -107,7 +108,7 @@ def _share_to_hard_walls(x, axis, i, length, radius, scratch, angle, walls, dof)
     part, reach = 1.0, reach_of(scratch, angle, length, dof)
     for w in range(kinds.shape[0]):
         if not is_soft[w] and weights[w, i] >= 1.0:
-            wall = kinds[w], places[w], sizes[w]
+            wall = kinds[w], places[w], sizes[w], False
             part = min(part, share_to_wall(
                 *wall, x, axis, i, length, radius, scratch, angle, reach, dof
             ))  # fmt: skip

@@ -32,7 +32,7 @@ from torchfilm.physics.contacts import CandidateContacts, Contacts, contacts_of
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.problem import NOT_FINITE, ContactProblem, SolveReport
 from torchfilm.physics.solve import solve_contacts
-from torchfilm.physics.wall_contacts import WallContacts, poses_along, reach_of, share_to_walls
+from torchfilm.physics.wall_contacts import WallContacts, poses_along, reach_of, share_to_wall
 from torchfilm.tools.reads import known_rows_where, numbers, rows_where
 from torchfilm.tools.vectors import safe_sqrt
 
@@ -187,6 +187,9 @@ def _share(cells: CellProperties, at: Moved, move: Tensor) -> tuple[Tensor, Tens
     too_far = turn > MAX_TURN
     share = torch.where(too_far, MAX_TURN / torch.where(too_far, turn, 1.0), 1.0)
     placed = poses_along(at.position, at.axis, at.length, share.unsqueeze(1) * move)
-    within = share.detach() * reach
-    cut = share_to_walls(cells.surfaces, placed, radius, cells.colony_ids, within)
+    within, cut = share.detach() * reach, torch.ones_like(radius)
+    for surface, (kind, weight) in zip(cells.surfaces, cells.walls, strict=True):
+        gives = kind == "stiffness" if weight is None or kind == "stiffness" else weight < 1
+        own = share_to_wall(surface, placed, radius, cells.colony_ids, within, gives)
+        cut = torch.minimum(cut, own)
     return reach, share * cut

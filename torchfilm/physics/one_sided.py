@@ -40,7 +40,7 @@ from torchfilm.physics.wall_contacts import (
     find_wall_contacts,
     poses_along,
     reach_of,
-    share_to_walls,
+    share_to_wall,
 )
 from torchfilm.tools.ragged import marked
 from torchfilm.tools.reads import numbers, rows_where
@@ -376,7 +376,7 @@ class _OneStep:
         for surface, (kind, weight) in zip(given.surfaces, given.walls, strict=True):
             if kind == "stiffness":
                 continue
-            cut = share_to_walls([surface], placed, given.radius, given.colony_ids, reach)
+            cut = share_to_wall(surface, placed, given.radius, given.colony_ids, reach)
             cut = cut if weight is None else torch.where(weight >= 1, cut, 1.0)
             share = torch.minimum(share, cut)
         return share

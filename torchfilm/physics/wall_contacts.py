@@ -120,7 +120,7 @@ def reach_of(length: Tensor, move: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def poses_along(position: Tensor, axis: Tensor, length: Tensor, move: Tensor):
-    """Poses of cells after a share of their moves (N, D), as `share_to_walls` takes them."""
+    """Poses of cells after a share of their moves (N, D), as `share_to_wall` takes them."""
     dim = position.shape[1]
 
     def at(share: float) -> Pose:
@@ -133,23 +133,24 @@ def poses_along(position: Tensor, axis: Tensor, length: Tensor, move: Tensor):
     return at
 
 
-def share_to_walls(
-    surfaces: Sequence[Surface],
+def share_to_wall(
+    surface: Surface,
     at: Callable[[float], Pose],
     radius: Tensor,
     colony_id: Tensor,
     reach: Tensor,
+    gives: Tensor | bool = False,
 ) -> Tensor:
     """The share of its move after which each cell comes to lie its radius behind a wall, (P,),
     nearly: of a move that turns, or at a round wall, it is interpolated.
 
-    A cell that was deeper gets no deeper. The check is needed because a wall that a cell did not
-    touch before the move may have no row in the solve. at: returns, for a share of the move,
-    position (P, d) float64, axis (P, d) and half length (P,). reach: no point of a cell moves
-    farther, (P,) µm.
+    A cell that was deeper gets no deeper; but in a wall that gives way it may come deeper by its
+    radius. The check is needed because a wall that a cell did not touch before the move may have no
+    row in the solve. at: returns, for a share of the move, position (P, d) float64, axis (P, d) and
+    half length (P,). reach: no point of a cell moves farther, (P,) µm. gives: (P,) or for all.
     """
 
-    def gap(surface: Surface, share: float) -> Tensor:
+    def gap(share: float) -> Tensor:
         position, axis, half = at(share)
         deepest = surface.deepest(
             position, axis.to(position.dtype), half.to(position.dtype), colony_id
@@ -159,17 +160,16 @@ def share_to_walls(
         )
         return distance.to(radius.dtype) - radius
 
-    out = torch.ones_like(radius)
-    for surface in surfaces:
-        places = 1 if isinstance(surface, FlatSurface) or surface.inside else POINTS_ON_MOVE
-        before = gap(surface, 0.0)
-        limit = torch.minimum(before, -radius)
-        if reads_are_free(radius.device) and not bool((before - reach < limit).any()):
-            continue
-        for k in range(places):
-            after = gap(surface, (k + 1) / places)
-            through = (after < limit) & (out > k / places)
-            part = (before - limit) / torch.where(through, before - after, 1.0)
-            out = torch.where(through, torch.minimum(out, (k + part) / places), out)
-            before = after
+    out, before = torch.ones_like(radius), gap(0.0)
+    soft = torch.as_tensor(gives, device=radius.device)
+    limit = torch.where(soft, before.clamp(max=0.0) - radius, torch.minimum(before, -radius))
+    if reads_are_free(radius.device) and not bool((before - reach < limit).any()):
+        return out
+    places = 1 if isinstance(surface, FlatSurface) or surface.inside else POINTS_ON_MOVE
+    for k in range(places):
+        after = gap((k + 1) / places)
+        through = (after < limit) & (out > k / places)
+        part = (before - limit) / torch.where(through, before - after, 1.0)
+        out = torch.where(through, torch.minimum(out, (k + part) / places), out)
+        before = after
     return out
