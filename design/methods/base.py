@@ -103,7 +103,7 @@ class Source(Method, Protocol):
         `fresh`: their rows and losses."""
 
 
-class AskTell:
+class AskTell(metaclass=checks.KnownKeywords):
     """The base class of the ready methods. `ask` returns the same batch until `tell`.
 
     A method proposes in `_next` and learns in `_take`; `start` calls `_begin`.

@@ -106,10 +106,11 @@ class Observed(Target):
         by name (a dictionary, or a pandas.DataFrame).
 
         Columns, of which any may be missing: x and y, the centre; length; angle; age; colony, which
-        tells replicates apart; and the species. columns: their names in the table where they
-        differ, such as {"x": "centroid_x"}. Units stand in the names of columns (x_um or x_px,
-        angle_deg or angle_rad, age_h or age_min) or in arguments: pixel_size, µm a pixel;
-        length_unit "um"; angle_unit "degrees" or "radians"; time_unit "h" or "min".
+        tells replicates apart; and those that `species` names: others are not compared. columns:
+        their names in the table where they differ, such as {"x": "centroid_x"}. Units stand in the
+        names of columns (x_um or x_px, angle_deg or angle_rad, age_h or age_min) or in arguments:
+        pixel_size, µm a pixel; length_unit "um"; angle_unit "degrees" or "radians"; time_unit "h"
+        or "min".
 
         length_with_caps: lengths include the caps, as masks measure them. relative: levels count
         relative to their mean in the colony, for a reporter in arbitrary units. rings: how many,

@@ -257,7 +257,10 @@ def test_a_search_fits_a_rate_to_data(tmp_path):
 
 def test_colonies_of_another_time_fail(seen):
     target = Observed.from_state(seen[0])
-    task = Task(lit, [Parameter("make", 1, 2)], target, until=1.0, replicates=1)
+    make = [Parameter("make", 1, 2)]
+    with pytest.raises(tf.InputError, match=r"until = 1\.0 .* at least 2\.5 h, when the target"):
+        Task(lit, make, target, until=1.0, replicates=1)
+    task = Task(lit, make, target, cells=3, replicates=1)  # ends when it ends
     found = Objective(task).evaluate(np.array([[0.5]]))
     assert found.loss[0] == target.failed and "observed at 2.5 h" in found.reasons[0, 0]
 

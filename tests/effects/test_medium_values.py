@@ -259,3 +259,13 @@ def test_a_flat_box_in_space_is_refused_unless_it_is_meant():
 def test_faces_of_a_signal_are_boundary_conditions(boundary):
     with pytest.raises(tf.InputError, match=r"Signal.boundary = .*BoundaryConditions\(x="):
         tf.Signal(diffusion=1.0, boundary=boundary)
+
+
+def test_a_flow_may_be_stated_for_each_colony():
+    """As `tf.PerColony`, or as a list of numbers: the same."""
+    flows = [
+        tf.Medium(ahl=tf.Signal(diffusion=10.0), box=((-8, -8), (8, 8)), spacing=4.0, flow=(x, 0.0))
+        .flow[0]
+        for x in (tf.PerColony([0.0, 30.0]), [0.0, 30.0])
+    ]  # fmt: skip
+    assert flows[0].tolist() == flows[1].tolist() == [0.0, 30.0]
