@@ -40,6 +40,13 @@ SPLITTINGS = ("lie", "strang")
 EXACT = ("exponential", "series")
 
 
+def _bare(flow: Any) -> Any:
+    """A velocity whose components for each colony are plain numbers."""
+    if not isinstance(flow, (tuple, list)):
+        return flow
+    return tuple(v.values if isinstance(v, PerColony) else v for v in flow)
+
+
 @dataclass(frozen=True, eq=False)
 class Signal(metaclass=checks.KnownKeywords):
     """A substance outside the cells.
@@ -72,7 +79,7 @@ class Signal(metaclass=checks.KnownKeywords):
             if name in ("diffusion", "reservoir") or not callable(given):
                 made = checked(f"Signal.{name}", given, rule)
                 object.__setattr__(self, name, made.values if isinstance(made, PerColony) else made)
-        object.__setattr__(self, "flow", checked_flow("Signal.flow", self.flow))
+        object.__setattr__(self, "flow", checked_flow("Signal.flow", _bare(self.flow)))
 
 
 @dataclass(frozen=True, init=False, eq=False)
@@ -155,7 +162,7 @@ class Medium(Effect):
             "depth": depth,
             "height": float(height),
             "boundary": boundary,
-            "flow": checked_flow("Medium.flow", flow),
+            "flow": checked_flow("Medium.flow", _bare(flow)),
             "obstacles": obstacles,
             "outside": outside,
             "grows": grows,

@@ -8,7 +8,6 @@ from typing import Any
 from torch import Tensor
 
 from torchfilm.tools import checks
-from torchfilm.values import PerColony
 
 # The most voxels of a colony's grid, 0.27 GB per signal in float32. Where the grid grows, one cell
 # that moves far away must not take all memory.
@@ -91,5 +90,4 @@ def checked_flow(name: str, given: Any) -> Any:
             "two or three components",
             "For one velocity per colony give (vx, vy), each a tensor with one number per colony.",
         )
-    each = (v.values if isinstance(v, PerColony) else v for v in given)
-    return tuple(checks.value(f"{name}[{k}]", v) for k, v in enumerate(each))
+    return tuple(checks.value(f"{name}[{k}]", v) for k, v in enumerate(given))
