@@ -130,7 +130,9 @@ class Best:
     def _report(self) -> report.SearchReport:
         search, first = self.search, self.search.first()
         first_guess, best = (
-            report.ReportedDesign(title, d.values, d.point, d.searched_loss, d.colonies(), d.fresh)
+            report.ReportedDesign(
+                title, d.values, d.point, d.searched_loss, d.searched, d.colonies(), d.fresh
+            )
             for title, d in (("first guess", first), ("best", self))
         )
         return report.SearchReport(

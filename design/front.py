@@ -18,7 +18,7 @@ from design.parameters import Value, right_aligned, show_value
 from design.pareto import nondominated, spread
 from design.report import at_bound, cells_in
 from design.study import Study
-from design.targets.goals import Constrained, Goals, in_words
+from design.targets.goals import Constrained, Goals, in_words, of_seeds
 from design.trivial import trivial_losses
 from torchfilm import displays
 
@@ -105,11 +105,12 @@ class Front:
             there = [str(k) for k, v in enumerate(self.values) if at_bound(p, v[p.name])]
             if there:
                 lines.append(f"{p.name} at a bound: design {', '.join(there)}")
-        ends = self[0].colonies() + (self[len(self) - 1].colonies() if len(self) > 1 else [])
-        lines.append(f"cells: {cells_in(ends)}")
+        first = self[0].colonies()
+        last = self[len(self) - 1].colonies() if len(self) > 1 else []
+        lines.append(f"cells: {cells_in(first + last)}")
         for title, part in zip(self.titles, task.target.parts, strict=True):
-            if part.names and part.pattern and not part.bounds:
-                found = trivial_losses(part, self[0].colonies())
+            compared = part.names and part.pattern and not part.bounds and not of_seeds(part)
+            if compared and (found := trivial_losses(part, first)):
                 each = ", ".join(f"{name} {loss:.3f}" for name, loss in found.items())
                 lines.append(f"{title} without a pattern: {each}")
         for reason, times in study.failures()[:1]:

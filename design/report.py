@@ -27,13 +27,15 @@ NEAR = 0.005  # of a bound, as a share of the range (of its logarithm)
 
 @dataclass(frozen=True, eq=False)
 class ReportedDesign:
-    """A design that a report shows: its values by name, its point (D,), its loss in the search, its
-    colonies at their ends, and its losses on fresh seeds, where it was tested."""
+    """A design that a report shows: its values by name, its point (D,), its loss in the search and
+    the losses (R,) of its replicates there, its colonies at their ends, and its losses on fresh
+    seeds, where it was tested."""
 
     title: str
     values: dict[str, Value]
     point: np.ndarray
     loss: float
+    losses: np.ndarray
     colonies: list[FinishedColonies]
     fresh: FreshLosses | None = None
 
@@ -189,8 +191,8 @@ def best_trivial(target: Target, answers: Mapping[str, float]) -> str:
 def _missed(report: SearchReport) -> str:
     """Which constraints colonies of the best design break."""
     target, best = report.task.target, report.best
-    losses = [best.loss * report.task.replicates] if best.fresh is None else best.fresh.losses
-    if not target.bounds or np.sum(losses) < Constrained.BROKEN:
+    losses = best.losses if best.fresh is None else best.fresh.losses
+    if not target.bounds or not best.colonies or np.max(losses) < Constrained.BROKEN:
         return ""
     found = measured(target, best.colonies)
     each = ", ".join(f"{n} {b}: it has {show_value(found[n])}" for n, b in target.bounds.items())

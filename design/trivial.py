@@ -13,6 +13,8 @@ from design.growing import FinishedColonies
 from design.objective import Objective
 from design.study import Study
 from design.targets.base import OUTSIDE, Target
+from design.targets.goals import Constrained
+from design.targets.several import Several
 from torchfilm import checks
 
 BRIGHT = 1e3  # a lit cell, relative to the greatest level that was found, or to 1
@@ -52,13 +54,14 @@ def check_within_reach(objective: Objective, study: Study) -> bool:
         return entry is not None
     failed = {row for row, _ in entry.reasons}
     grew = [k for k in range(len(entry.points)) if k not in failed]
-    patterns = _patterns(task.target)
-    if not grew or (len(patterns) == 1 and np.ptp(entry.losses[grew]) > 1e-9):
+    several = isinstance(task.target, Several)
+    if not grew or (not several and np.ptp(entry.losses[grew]) > 1e-9):
         return True
     states = [part.state for part in objective.colonies(entry.points[grew[0]])]
     within = lambda pattern: any(bool(pattern.reaches(state).any()) for state in states)
+    patterns = _patterns(task.target, states[0]) if states else []
     beyond = next((pattern for pattern in patterns if not within(pattern)), None)
-    if not states or beyond is None:
+    if beyond is None:
         return True
     cells = max(int(state.counts.max()) for state in states)
     reach = max(float(state.position.norm(dim=1).max()) for state in states)
@@ -69,10 +72,14 @@ def check_within_reach(objective: Objective, study: Study) -> bool:
     )
 
 
-def _patterns(target: Target) -> list[Target]:
-    """The target, or all of which it is made."""
-    parts = getattr(target, "parts", ())
-    return [found for part in parts for found in _patterns(part)] or [target]
+def _patterns(target: Target, state: tf.State) -> list[Target]:
+    """The target, or all of which its loss is made: not those that are only measured."""
+    if isinstance(target, Constrained):
+        return [found for part in (target.target, *target.bounding(state))
+                for found in _patterns(part, state)]  # fmt: skip
+    if isinstance(target, Several):
+        return [found for part in target.parts for found in _patterns(part, state)]
+    return [target]
 
 
 def _greatest(state: tf.State, name: str) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from differences import F64, between_walls, check, growing, run, seeded
+from differences import F64, between_walls, check, growing, outcome, run, seeded
 
 import torchfilm as tf
 
@@ -121,3 +121,16 @@ def test_where_a_turn_is_cut_short(contacts):
 
     check(experiment, 0.05)
     assert min(cut) > 0
+
+
+def test_colonies_that_do_not_grow_have_gradients():
+    """What bounds α from below is the force that stops growth: 0 here, in one of two colonies."""
+    rate = torch.tensor([0.0, 0.5], dtype=F64, requires_grad=True)
+    where, way = [[0.0, 0.0], [0.4, 0.8]], [[1.0, 0.0], [0.9553364, 0.29552]]
+    scene = tf.Scene(
+        tf.Growth(rate=tf.PerColony(rate), law="length"), tf.Mechanics(dim=2, tolerance=1e-9),
+        founders=tf.Cells(where, way, [2.0, 2.2], [0.5, 0.5]),
+    )  # fmt: skip
+    state = run(scene, scene.bind(2, dtype=F64).start(), steps=3, dt=0.01)
+    (found,) = torch.autograd.grad(outcome(state), rate)
+    assert bool(torch.isfinite(found).all()) and bool((found != 0).all())

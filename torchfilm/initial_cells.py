@@ -231,7 +231,7 @@ class Cells(metaclass=checks.KnownKeywords):
         frame: the cells to take, of a table with several frames. Labels name cells in messages.
         fields: further columns that become fields of the cells, by name or {"field": "column"};
         without `columns`, by default all others, but never those that number cells or frames, and
-        of a table of torchfilm's results only fields of its cells.
+        of a table of torchfilm's results not what belongs to the run, nor signals outside.
 
         Raises InputError for a column that is missing, has no unit, is not numbers or is used
         twice, for rows with one label or one place, for several frames, and for arguments that

@@ -231,10 +231,15 @@ class Constrained(Several):
                 )
 
     def _measured(self, state: tf.State) -> list[dict[str, Tensor]]:
-        """Of a first state: the measures of each part."""
+        """Of a state alone: the measures of each part."""
         note = self.note(state)
         history = None if note is None else note.unsqueeze(0)
         return self._each(lambda part, own: part.measures(state, own), state, history)
+
+    def bounding(self, state: tf.State) -> list[Target]:
+        """Those of its targets that have the measures of the constraints."""
+        each = zip(self.parts, self._measured(state), strict=True)
+        return [part for part, found in each if found.keys() & self.bounds.keys()]
 
     def missed(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         """By how much the constraints are missed, (B,): the sum over all of the distance to the
@@ -302,8 +307,10 @@ class Spread(Several):
         return self.losses(state, history)[:, 0]
 
     def reduced(self, losses: np.ndarray) -> np.ndarray | None:
-        """Seeds that all fail are alike, and no goal: the design has failed."""
+        """Seeds that all fail, or all break a constraint, are alike, and no goal: the design has
+        the worst of their losses."""
         wide = losses.std(1, ddof=1) if losses.shape[1] > 1 else np.zeros(len(losses))
+        wide = np.where((losses >= Constrained.BROKEN).any(1), losses.max(1), wide)
         return np.where((losses == self.failed).any(1), self.failed, wide)
 
     def describe(self) -> str:

@@ -8,7 +8,7 @@ import pytest
 from searching import Level, lit
 
 import torchfilm as tf
-from design import NSGA2, Burden, Constrained, OnFraction, Parameter, Search, Weighted
+from design import NSGA2, Burden, Constrained, OnFraction, Parameter, Search, Spread, Weighted
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 
@@ -80,3 +80,20 @@ def test_every_second_cell_lit_is_no_trivial_answer_to_a_share_of_lit_cells():
     made = Search(lit, LIT, OnFraction("gfp", 0.5, level=1.0), cells=8, replicates=2)
     said = made.run(colonies=24, progress=False).table()
     assert "every second lit 0.0" in said and "'every second lit'" not in said
+
+
+def test_seeds_that_all_break_a_constraint_are_not_alike_but_broken():
+    """Their losses hardly differ, and a spread of 0 would be the best there is."""
+    spread = Spread(Constrained(Level(), at_least={"mean_level": 1.0}))
+    broken, held = [1e4 + 0.5, 1e4 + 0.5], [0.2, 0.4]
+    found = spread.reduced(np.array([broken, held, [0.2, 1e4 + 0.1]]))
+    assert (found[[0, 2]] >= Constrained.BROKEN).all() and found[1] < 1.0
+
+
+def test_large_losses_that_meet_the_constraints_are_not_called_broken():
+    target = Constrained(Burden(), at_most={"burden": 1e6})
+    lots = lambda make: lit(make=1e4 * make, decay=0.5)
+    made = Search(lots, [Parameter("make", 1.0, 2.0)], target, cells=3, replicates=2)
+    best = made.run(colonies=60, progress=False)
+    assert best.losses.sum() > Constrained.BROKEN > best.losses.max()
+    assert "misses the constraints" not in best.table()

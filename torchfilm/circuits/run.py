@@ -403,6 +403,7 @@ def _runaway(circuit: CircuitCells, concentrations: Tensor, k: int, dt: float) -
     )
 
 
+@torch.no_grad()
 def _not_finite(circuit: CircuitCells, concentrations: Tensor, k: int, dt: float) -> list[str]:
     """The species and signals whose rates in the k-th cell are not finite, at the start of the step
     or further along it: an adaptive method stops before it gets there."""

@@ -320,8 +320,9 @@ def go(
             if interrupted.is_set():
                 raise KeyboardInterrupt
             if full is not None and state.step % LOOK == 0:
-                ended = full(state) | (state.counts >= full.cells) | (state.counts == 0)
-                if bool(ended.all()):
+                still = full(state)
+                ended = still | (state.counts >= full.cells) | (state.counts == 0)
+                if bool(still.any()) and bool(ended.all()):
                     tqdm.write(
                         f"ended at {state.time:g} h: no colony grows on to {full.cells} cells. For"
                         " another end give --cells or --until."

@@ -382,7 +382,7 @@ def _fields(table: Table, reading: Reading, used: set[str]) -> dict[str, np.ndar
         return {}
     numbering = (*LABELS, *FRAMES, *ROWS)
     left = [n for n in table.columns if n not in used and n.lower() not in numbering]
-    if all(n in table.columns for n in OF_RESULTS):  # signals and parameters have dots
+    if all(n in table.columns for n in OF_RESULTS):  # signals outside have dots
         left = [n for n in left if n not in OF_RESULTS and n.isidentifier()]
     return {name: table.numbers(name, optional=True) for name in left}
 

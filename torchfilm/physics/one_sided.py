@@ -75,7 +75,8 @@ class _OneStep:
         whole = length + growth + 2 * given.radius
         self.softest = SOFTEST * yielding / OVERLAP / mean(given.viscosity * whole)
         held = mean(given.length_drag * growth.clamp(min=0.0))
-        least = torch.where(held > 0, UNMOVED * self.target / held, torch.inf)
+        some = held > 0  # a division by 0 would spoil gradients
+        least = torch.where(some, UNMOVED * self.target / torch.where(some, held, 1.0), torch.inf)
         self.hardest = torch.minimum(HARDEST * self.softest, least)
         with torch.no_grad():
             overlap = given.settings.overlap
