@@ -81,7 +81,7 @@ def test_the_file_serves_other_data_but_no_other_simulations(data, tmp_path):
     assert other.values != data.values
     assert alike(simulate_designs(task_of(other), 4, path=path), one)
     for options, word in (
-        ({"until": 1.0}, "until"),
+        ({"until": 3.0}, "until"),
         ({"seed": 1}, "seed"),
         ({"replicates": 1}, "replicates"),
         ({"parameters": [Parameter("rate", 0.5, 2.0, log=True)]}, "parameters"),
