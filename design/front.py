@@ -16,7 +16,7 @@ from design.front_plot import draw_front
 from design.objective import Objective
 from design.parameters import Value, right_aligned, show_value
 from design.pareto import nondominated, spread
-from design.report import at_bound, cells_in
+from design.report import at_bound, cells_in, cost_words, failure_words
 from design.study import Study
 from design.targets.goals import Constrained, Goals, in_words, of_seeds
 from design.trivial import trivial_losses
@@ -113,11 +113,8 @@ class Front:
             if compared and (found := trivial_losses(part, first)):
                 each = ", ".join(f"{name} {loss:.3f}" for name, loss in found.items())
                 lines.append(f"{title} without a pattern: {each}")
-        for reason, times in study.failures()[:1]:
-            lines.append(f"most frequent failure: {reason} ({times} colonies)")
-        failed = f", {study.failed} failed" if study.failed else ""
-        spent = f"{study.colonies:.0f} colonies in {study.time}{failed}"
-        return [*lines, f"{spent}; {study.about.get('method', '')}".rstrip("; ")]
+        spent = f"{cost_words(study)}; {study.about.get('method', '')}".rstrip("; ")
+        return [*lines, *failure_words(study), spent]
 
     @property
     def _seeds(self) -> int:

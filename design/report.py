@@ -84,11 +84,7 @@ def table(report: SearchReport) -> str:
     ]
     lines += _undefined(target, new)
     lines += _warnings(report)
-    failed = study.failed
-    lines += [
-        f"most frequent failure: {reason} ({times} colonies)"
-        for reason, times in study.failures()[:1]
-    ]
+    lines += failure_words(study)
     how = (
         f"grown again for each design: {report.why_regrown}"
         if report.why_regrown
@@ -96,9 +92,20 @@ def table(report: SearchReport) -> str:
     )
     if report.why_chosen:
         lines.append(report.why_chosen)
-    spent = f"{study.colonies:.0f} colonies in {study.time}"
-    lines.append(spent + (f", {failed} failed" if failed else "") + f"; {how}")
+    lines.append(f"{cost_words(study)}; {how}")
     return "\n".join(lines)
+
+
+def failure_words(study: Study) -> list[str]:
+    """The most frequent failure of a search, if there is one."""
+    each = study.failures()[:1]
+    return [f"most frequent failure: {reason} ({times} colonies)" for reason, times in each]
+
+
+def cost_words(study: Study) -> str:
+    """What a search took, and how many colonies failed."""
+    failed = f", {study.failed} failed" if study.failed else ""
+    return f"{study.colonies:.0f} colonies in {study.time}{failed}"
 
 
 def parameter_rows(

@@ -191,14 +191,17 @@ class CircuitGraph:
         kind, _, own = leaf.name.partition(".")
         return leaf.name if kind == "p" and own in self.species else text(leaf)
 
+    def _keys(self) -> dict[str, None]:
+        """The names of all that the rates read, in order."""
+        return dict.fromkeys(self._key(e) for e in walk(self._all()) if e.op == NAME)
+
     def _values(self, values: Mapping[str, Any]) -> dict[str, Tensor]:
         """Values by name as tensors of one shape. Raises InputError for what is none, or for a name
         that is lacking or not known."""
-        names = dict.fromkeys(self._key(e) for e in walk(self._all()) if e.op == NAME)
-        given = {}
+        names, given = self._keys(), {}
+        known = (*names, *self.species, *self.parameters)
         for name, value in values.items():
-            read = (*names, *self.species, *self.parameters)
-            if name not in read and not name.startswith((OUTSIDE, "cell.", "p.")):
+            if name not in known and not name.startswith((OUTSIDE, "cell.", "p.")):
                 raise checks.InputError(unknown(f"values have {name!r}", name, list(names)))
             try:
                 given[name] = torch.as_tensor(value, dtype=torch.float64)
@@ -235,9 +238,8 @@ class CircuitGraph:
         """Rates of amounts in a cell of volume 1 at PLACES random places, all values from low to
         high, even by their logarithms; (K, rows), of the places where all are finite."""
         rng = np.random.default_rng(seed)
-        names = dict.fromkeys(self._key(e) for e in walk(self._all()) if e.op == NAME)
         draw = lambda: np.exp(rng.uniform(np.log(low), np.log(high), PLACES))
-        values = {n: draw() for n in names} | {"cell.volume": np.ones(PLACES)}
+        values = {n: draw() for n in self._keys()} | {"cell.volume": np.ones(PLACES)}
         found = self.evaluate(values).values()
         columns = [np.broadcast_to(x.numpy(), (PLACES,)) for x in found]
         rates = np.stack(columns, 1) if columns else np.zeros((PLACES, 0))

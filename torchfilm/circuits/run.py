@@ -360,7 +360,7 @@ def words(
             reaction = circuit.part.reactions[code - MOLECULES]
             return (
                 f"the reaction {reaction.name or str(reaction)!r} has"
-                " a propensity that is negative or not a finite number"
+                f" {stochastic.STATUS[stochastic.BAD_PROPENSITY]}"
             )
         return stochastic.STATUS[code]
     if code == rosenbrock.BELOW_ZERO:

@@ -24,7 +24,7 @@ DONE, TOO_MANY_EVENTS, BAD_PROPENSITY = 0, 1, 2
 STATUS = {
     DONE: "done",
     TOO_MANY_EVENTS: "too many events",
-    BAD_PROPENSITY: "a propensity is negative or not a finite number",
+    BAD_PROPENSITY: "a propensity that is negative or not a finite number",
 }
 FEW_EVENTS = 10.0  # a leap with fewer events costs more than single events
 MAX_LEAP_HALVINGS = 60

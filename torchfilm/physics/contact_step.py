@@ -183,7 +183,7 @@ def _share(cells: CellProperties, at: Moved, move: Tensor) -> tuple[Tensor, Tens
     """
     radius = cells.radius
     turn = safe_sqrt(move[:, cells.settings.dim : -1].square().sum(1))
-    _, reach = reach_of(at.length.detach(), move.detach())
+    reach = reach_of(at.length.detach(), move.detach())
     too_far = turn > MAX_TURN
     share = torch.where(too_far, MAX_TURN / torch.where(too_far, turn, 1.0), 1.0)
     placed = poses_along(at.position, at.axis, at.length, share.unsqueeze(1) * move)

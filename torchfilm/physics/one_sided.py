@@ -372,7 +372,7 @@ class _OneStep:
         given, share = self.given, torch.ones_like(self.given.radius)
         if not given.surfaces:
             return share
-        _, reach = reach_of(at.length.detach(), made.detach())
+        reach = reach_of(at.length.detach(), made.detach())
         placed = poses_along(at.position, at.axis, at.length, made)
         for surface, (kind, weight) in zip(given.surfaces, given.walls, strict=True):
             if kind == "stiffness":

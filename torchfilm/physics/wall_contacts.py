@@ -111,12 +111,11 @@ def _contact_candidates(
     ]
 
 
-def reach_of(length: Tensor, move: Tensor) -> tuple[Tensor, Tensor]:
-    """By which angle cells turn in their moves (N, D), and how far their points may move, at most,
-    µm, (N,) each."""
+def reach_of(length: Tensor, move: Tensor) -> Tensor:
+    """How far points of cells may move, at most, in their moves (N, D): (N,) µm."""
     dim = 2 if move.shape[1] == 4 else 3
     way, turn = (x.square().sum(1).sqrt() for x in (move[:, :dim], move[:, dim:-1]))
-    return turn, way + 0.5 * turn * length + 0.5 * move[:, -1].clamp(min=0.0)
+    return way + 0.5 * turn * length + 0.5 * move[:, -1].clamp(min=0.0)
 
 
 def poses_along(position: Tensor, axis: Tensor, length: Tensor, move: Tensor):
