@@ -351,7 +351,8 @@ def _null_space(rates: np.ndarray) -> list[list[int]]:
             if other != k:
                 basis[other] -= basis[other, column] * basis[k]
         done.append(column)
-    basis = basis * (scale[done].reshape(-1, 1) / scale)
+    # rounding, which the scale of a slow species would make large
+    basis = np.where(np.abs(basis) < 1e-9, 0.0, basis) * (scale[done].reshape(-1, 1) / scale)
     found = []
     for row in basis:
         shares = [Fraction(float(x)).limit_denominator(1000) for x in row]
