@@ -303,7 +303,22 @@ def test_a_step_in_which_a_cell_divides_twice_is_an_error(options):
         tf.InputError, match=r"due to divide more than once in a step.*Take dt below"
     ):
         tf.simulate(scene, until=3.0, dt=options.get("dt"))
-    quiet(lambda: tf.simulate(tf.scenes.microcolony(rate=1.0), until=1.0, dt=0.5))
+
+
+@pytest.mark.parametrize("effect", ["growth", "monod"])
+def test_a_long_step_is_warned_of(effect):
+    """By which a cell grows by more than a fifth."""
+    growth = [tf.Growth(rate=1.0)]
+    if effect == "monod":
+        growth = [
+            tf.Medium(food=tf.Signal(10.0, initial=1.0), box=((-8, -8), (8, 8)), spacing=4.0),
+            tf.Monod("food", rate=1.0), tf.Growth(),
+        ]  # fmt: skip
+    scene = tf.Scene(*growth, tf.Division(length=4.0), dim=2)
+    words = r"dt = 0\.25 h is long for \w+\.rate = 1/h: a cell grows by 28% in a step.*below 0\.2 h"
+    with pytest.warns(UserWarning, match=words):
+        next(tf.simulate(scene, until=1.0, dt=0.25))
+    quiet(lambda: next(tf.simulate(scene, until=1.0, dt=0.2)))
 
 
 def test_founders_in_one_another_are_warned_of():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import warnings
 from dataclasses import dataclass
@@ -402,3 +403,14 @@ def test_what_a_report_is_concerned_about_is_warned_of_once_at_the_users_line():
     (one,) = (w for w in told if w.category is RuntimeWarning)
     assert str(one.message) == "step 3 (t = 0.3 h): colony [1] looks odd"
     assert one.filename == __file__
+
+
+def test_a_run_of_which_no_state_is_taken_is_warned_of(tmp_path):
+    scene = tf.scenes.microcolony()
+    with pytest.warns(RuntimeWarning, match=r"has simulated nothing.*for state in tf\.simulate"):
+        states = tf.simulate(scene, until=0.1, record=tmp_path / "run.h5")
+        assert "not begun" in repr(states)
+        del states
+        gc.collect()
+    for taken in (next, list, lambda states: states.close()):
+        taken(tf.simulate(scene, until=0.1))  # any warning is an error here

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -42,6 +43,42 @@ def advance(
             state = state if seen is None else seen
         sent = yield state
         state = state if sent is None else sent
+
+
+class States(Generator[State, State | None, None]):
+    """The states of a run, one after each step. A run of which nobody takes a state has not begun,
+    and is warned of."""
+
+    def __init__(self, states: Generator[State, State | None, None]):
+        self._states, self._begun = states, False
+
+    def __next__(self) -> State:
+        return self.send(None)
+
+    def send(self, value: State | None) -> State:
+        self._begun = True
+        return self._states.send(value)
+
+    def throw(self, *error: Any) -> State:
+        self._begun = True
+        return self._states.throw(*error)
+
+    def close(self) -> None:
+        self._begun = True
+        self._states.close()
+
+    def __repr__(self) -> str:
+        begun = "begun" if self._begun else "not begun: take its states, as by `for state in …`"
+        return f"<states of a run that has {begun}>"
+
+    def __del__(self) -> None:
+        if not self._begun:
+            warn(
+                "simulate(…) has simulated nothing, since none of its states was taken. Write"
+                " `for state in tf.simulate(…): …`, with `pass` where only the last state, or the"
+                " file of results, is wanted.",
+                category=RuntimeWarning,
+            )
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,14 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from torchfilm.loop import EndlessRunWarning, LastingConcerns, Monitor, advance, handle_failures
+from torchfilm.loop import (
+    EndlessRunWarning,
+    LastingConcerns,
+    Monitor,
+    States,
+    advance,
+    handle_failures,
+)
 from torchfilm.model import Model
 from torchfilm.replay import Replay
 from torchfilm.scene import Scene
@@ -47,8 +54,9 @@ def simulate(
     on_failure: str = "raise",
     timings: Timings | None = None,
     progress: bool | None = False,
-) -> Generator[State, None, None]:
-    """Run a scene, yielding the state after each step.
+) -> States:
+    """Run a scene, yielding the state after each step. Nothing is simulated before the states are
+    taken, as by `for state in simulate(…)`.
 
     scene: a scene, which is bound here to `colonies` colonies, or a model. seed, streams, device,
     dtype: as in `Scene.bind`, by default 0, stream k for colony k, "cpu" and torch.float32. Where a
@@ -84,7 +92,7 @@ def simulate(
     bar = _run_bar(model, state, cells, until) if wanted(progress) else None
     first = (*((recorder,) if recorder else ()), *observers)
     step = partial(model.step, dt=dt, timings=timings)
-    return _run(
+    states = _run(
         step,
         state,
         partial(_ended, last, cells),
@@ -92,6 +100,7 @@ def simulate(
         (*monitors, *((bar,) if bar else ())),
         (*((recorder,) if recorder else ()), *observers, *((bar,) if bar else ())),
     )
+    return States(states)
 
 
 def _run_bar(model: Model, state: State, cells: int | None, until: float | None) -> RunBar:
@@ -173,7 +182,7 @@ def _ended(last: float, cells: int | None, state: State) -> bool:
     return bool(((counts >= cells) | (counts == 0)).all())
 
 
-def _run(step, state, stop, first, monitors, seen) -> Generator[State, None, None]:
+def _run(step, state, stop, first, monitors, seen) -> Generator[State, State | None, None]:
     """seen: who may have something to close at the end, each of them also after an error."""
     with ExitStack() as end:
         for observe in reversed(seen):
