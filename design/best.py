@@ -81,7 +81,8 @@ class Best:
     @property
     def band(self) -> tuple[float, float] | None:
         """Where the loss lies with a probability of 90 %; None where the design was not tested on
-        fresh seeds."""
+        fresh seeds. That of reduce="worst" ends at the worst seed that was grown: of S seeds, a new
+        one is worse with a probability of 1/(S + 1)."""
         return None if self.fresh is None else self.fresh.band
 
     def __repr__(self) -> str:
@@ -96,7 +97,9 @@ class Best:
         rows = report.parameter_rows(self.objective.task.space, first, self.values)
         losses: list[tuple[str, str]] = [("loss in the search", f"{self.searched_loss:.4f}")]
         if self.fresh is not None:
-            losses.append(("loss on fresh seeds", report.fresh_words(self.fresh)))
+            losses.append(
+                ("loss on fresh seeds", report.fresh_words(self.objective.task, self.fresh))
+            )
         study = self.search.study
         losses.append(("grown", f"{study.colonies:.0f} colonies in {study.time}"))
         head = ("parameter", "bounds", "first guess", "best design", "")

@@ -110,7 +110,7 @@ class Front:
         lines.append(f"cells: {cells_in(first + last)}")
         for title, part in zip(self.titles, task.target.parts, strict=True):
             compared = part.names and part.pattern and not part.bounds and not of_seeds(part)
-            if compared and (found := trivial_losses(part, first)):
+            if compared and (found := trivial_losses(part, first, task.reduced)):
                 each = ", ".join(f"{name} {loss:.3f}" for name, loss in found.items())
                 lines.append(f"{title} without a pattern: {each}")
         spent = f"{cost_words(study)}; {study.about.get('method', '')}".rstrip("; ")

@@ -62,7 +62,7 @@ def table(report: SearchReport) -> str:
     rows += _goals(report)
     if best.fresh is not None:
         title, loss = f"{_loss_title(report)} on fresh seeds", f"{best.fresh.loss:.4f}"
-        rows.append((title, "", "", loss, _seeds(best.fresh)))
+        rows.append((title, "", "", loss, _seeds(report.task, best.fresh)))
     rows.append(("cells", "", *(cells_in(design.colonies) for design in (first, best)), ""))
     target = report.task.target
     old, new = (each_measured(target, design.colonies) for design in (first, best))
@@ -125,14 +125,17 @@ def parameter_rows(
     ]
 
 
-def fresh_words(fresh: FreshLosses) -> str:
+def fresh_words(task: Task, fresh: FreshLosses) -> str:
     """The loss on fresh seeds, with its band."""
-    return f"{fresh.loss:.4f} ({_seeds(fresh)})"
+    return f"{fresh.loss:.4f} ({_seeds(task, fresh)})"
 
 
-def _seeds(fresh: FreshLosses) -> str:
+def _seeds(task: Task, fresh: FreshLosses) -> str:
+    seeds = len(fresh.losses)
+    if task.worst:  # no band tells what lies beyond the worst of some seeds; their order does
+        return f"the worst of {seeds} seeds; 1 new seed in {seeds + 1} is worse"
     low, high = fresh.band
-    return f"{low:.4f} … {high:.4f}, {len(fresh.losses)} seeds"
+    return f"{low:.4f} … {high:.4f}, {seeds} seeds"
 
 
 def _loss_title(report: SearchReport) -> str:
@@ -214,7 +217,7 @@ def trivial_answers(report: SearchReport) -> dict[str, float]:
     nothing; data, and a target without species, have none."""
     target, colonies = report.task.target, report.best.colonies
     compared = target.names and target.pattern and not report.task.goals and colonies
-    return trivial_losses(target, colonies) if compared else {}
+    return trivial_losses(target, colonies, report.task.reduced) if compared else {}
 
 
 def _undefined(target: Target, found: Mapping[str, list[float]]) -> list[str]:

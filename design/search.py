@@ -157,6 +157,11 @@ class Search(TaskOptions):
         if entries and all(len(e.reasons) == e.losses.size for e in entries):
             reason = self.study.failures()[0][0]
             print(f"every colony failed; the most frequent reason: {reason}", file=sys.stderr)
+        remark = (
+            getattr(self._progress.chosen.method, "remark", "") if self._progress.chosen else ""
+        )
+        if remark:
+            print(remark, file=sys.stderr)
         each = self.objective.task.replicates
         if sum(len(e.points) for e in entries) == 1 and colonies < 2 * each:
             print(

@@ -185,6 +185,12 @@ class Task(TaskOptions):
         return np.quantile(losses, float(self.reduce), axis=1)
 
     @property
+    def worst(self) -> bool:
+        """Whether the loss of a design is that of its worst colony."""
+        by_target = self.target.reduced(np.zeros((1, self.replicates))) is not None
+        return not by_target and self.reduce in ("worst", 1)
+
+    @property
     def goals(self) -> int:
         """How many goals stand side by side; 0 where there is one target."""
         return len(self.target.parts) if isinstance(self.target, Goals) else 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import torch
@@ -22,10 +22,19 @@ EVERY_SECOND = "every second lit"
 LEVELS = 25  # even levels that are tried, over six orders of magnitude
 
 
+def _means(losses: np.ndarray) -> np.ndarray:
+    return losses.mean(1)
+
+
 @torch.no_grad()
-def trivial_losses(target: Target, finished: Iterable[FinishedColonies]) -> dict[str, float]:
-    """The mean losses of some colonies if all cells were dark, if all were lit, if every second
-    one was, and at the even level that is best."""
+def trivial_losses(
+    target: Target,
+    finished: Iterable[FinishedColonies],
+    reduced: Callable[[np.ndarray], np.ndarray] = _means,
+) -> dict[str, float]:
+    """The losses of some colonies if all cells were dark, if all were lit, if every second one was,
+    and at the even level that is best. reduced: how the losses of colonies become one, (n, R) to
+    (n,); by default their mean."""
     found: dict[str, list[float]] = {}
     even: list[np.ndarray] = []
     for part in finished:
@@ -36,9 +45,9 @@ def trivial_losses(target: Target, finished: Iterable[FinishedColonies]) -> dict
         for name, level in (("all dark", 0.0), ("all lit", bright), (EVERY_SECOND, second)):
             found.setdefault(name, []).extend(loss(level))
         even.append(np.array([loss(x) for x in np.geomspace(1e-6, 1.0, LEVELS) * bright]))
-    answers = {name: float(np.mean(values)) for name, values in found.items()}
+    answers = {name: float(reduced(np.array([values]))[0]) for name, values in found.items()}
     if even:
-        answers["best even level"] = float(np.concatenate(even, 1).mean(1).min())
+        answers["best even level"] = float(reduced(np.concatenate(even, 1)).min())
     return answers
 
 

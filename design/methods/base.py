@@ -70,7 +70,8 @@ class Method(Protocol):
 
     The result of `ask` must depend only on the arguments of `start`, the method's settings, and all
     calls of `tell`: a new method resumes a stopped search from the batches and losses of its study.
-    A method with `describe() -> str` is recognised when a search is resumed. One with `know(points,
+    A method with `describe() -> str` is recognised when a search is resumed. One with a property
+    `remark` has it printed at the end of a run, unless it is "". One with `know(points,
     loss)` learns before its first batch of the designs from which a search starts; `loss` is as for
     `tell`. One with `recall(points)` is told, where a search is resumed, what its next `ask` gave
     then (None: not known), and need not work it out again.
@@ -155,6 +156,11 @@ class AskTell(metaclass=checks.KnownKeywords):
 
     def know(self, points: np.ndarray, loss: np.ndarray) -> None:
         """Learn designs that were known before the first batch, (n, D), and their losses (n,)."""
+
+    @property
+    def remark(self) -> str:
+        """What a user should know of a run that has ended here, or ""."""
+        return ""
 
     def describe(self) -> str:
         """The method and its settings, on one line."""

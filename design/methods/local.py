@@ -172,10 +172,26 @@ class Local(AskTell):
         self._waiting: list[tuple[np.ndarray, float]] = []
         self._descents: list[Descent] = []
         self._asked: list[Descent] = []
+        self._descended = False
 
     def know(self, points: np.ndarray, loss: np.ndarray) -> None:
         """The first descents begin at these, the best first."""
         self._wait(points, loss, len(points))
+
+    @property
+    def _opening(self) -> int:
+        """The Sobol designs before descents."""
+        return self.first or 16 * self.starts
+
+    @property
+    def remark(self) -> str:
+        if self._descended:
+            return ""
+        return (
+            f"the search ended before its first descent: the {self._opening} Sobol designs from"
+            " which descents start took all colonies. Give it more colonies, or fewer such designs:"
+            " method=Local(first=…, starts=…)."
+        )
 
     @property
     def idle(self) -> bool:
@@ -187,7 +203,7 @@ class Local(AskTell):
         while self._waiting and len(self._descents) < self.starts:
             self._descents.append(Descent(*self._waiting.pop(0), self._replicates))
         if not self._descents:
-            count = self.first or 16 * self.starts
+            count = self._opening
             points = sobol_points(self._started(), self._seed, self._tried, count)
             self._tried += count
             return Batch(points)
@@ -210,5 +226,6 @@ class Local(AskTell):
         self._waiting = [(points[k], float(loss[k])) for k in unlike(points, loss, most)]
 
     def _descend(self, loss: np.ndarray, slopes: Slopes) -> None:
+        self._descended = True
         for k, descent in enumerate(self._asked):
             descent.set_slopes(slopes.gradient[k], slopes.curvature[k])

@@ -155,6 +155,10 @@ def test_bands_of_quantiles(reduce):
     best = search(reduce=reduce).run(400, progress=False)
     low, high = best.band
     assert low <= best.loss <= high <= best.losses.max()
+    seeds = len(best.losses)
+    words = f"the worst of {seeds} seeds; 1 new seed in {seeds + 1} is worse"
+    for shown in (best.table(), best._repr_html_()):
+        assert (words in shown) == (reduce == "worst")
 
 
 def study_of(task, losses):

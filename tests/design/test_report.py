@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from patterned import crowded
-from searching import Level, Spread, banned, built, fragile, lit
+from searching import Level, Spread, banned, built, fragile, lit, uneven
 
 import torchfilm as tf
 from design import Bands, Batch, Choice, Objective, Parameter, Search, Sobol, Stripe, Target, Task
@@ -259,6 +259,18 @@ def test_both_designs_are_drawn_with_one_scale_of_colours(tmp_path, monkeypatch)
     searched(lit, LIT, Bands(("gfp",), edges=(-2.0, 2.0))).plot(tmp_path / "best.png")
     assert len(seen) == 4 and len(set(levels)) > 1
     assert all(limits == {"gfp": (0.0, max(levels))} for limits in seen)
+
+
+def test_trivial_answers_are_reduced_as_the_designs_are():
+    target = Stripe("gfp", at=0.0, width=1.0)
+    options = {"colonies": 8, "replicates": 4, "cells": 7}
+    words = [
+        next(line for line in searched(uneven, LIT[:1], target, reduce=reduce, **options)
+             .table().splitlines() if line.startswith("without a pattern"))
+        for reduce in ("mean", "worst")
+    ]  # fmt: skip
+    mean, worst = ([float(part.split()[-1]) for part in line.split(", ")] for line in words)
+    assert mean != worst and all(m <= w for m, w in zip(mean, worst, strict=True))
 
 
 def test_a_picture_says_what_it_shows():
