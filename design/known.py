@@ -70,6 +70,8 @@ def known_designs(given: Start, task: Task) -> KnownDesigns:
     the bounds or of no parameter, and for a file that is not one of a study or of a design."""
     if isinstance(given, str | Path):
         path = Path(given)
+        if not path.is_file():
+            raise checks.input_error("start", str(given), "a file that exists")
         given = read_design(path)["parameters"] if path.suffix == ".json" else Study.read(path)
     if isinstance(given, Study):
         return _of_study(given, task)
@@ -111,8 +113,9 @@ def _usual(task: Task, name: str) -> Value:
     usual = inspect.Parameter.empty if found is None else found.default
     if isinstance(usual, bool | int | float | str):
         return usual
-    raise checks.input_error(
-        "start", f"no {name!r}", f"a value for {name}", "The scene function has no default for it."
+    raise checks.InputError(
+        f"start has no value for {name!r}, and the scene function has no default for it. Give"
+        f" start={{{name!r}: …}}."
     )
 
 

@@ -42,8 +42,7 @@ PARAMETERS = [
 NARROW = {"width_um": 2.0, "contrast": 100.0}  # at most, at least
 TARGET = Stripe("yfp", at="border", width=4.0, cell_type=1, floor=0.2)
 # Colonies of 1,000 cells in a channel: smaller ones have no place far from the border, which should
-# be dark. A step of 0.05 h and rtol 0.01 change a loss by 0.003 at most and take a third of the
-# time.
+# be dark. A step of 0.05 h and rtol 0.01 change a loss by 0.003 at most.
 COLONY = {"cells": 1000, "dt": 0.05, "fixed": {"width": 32.0, "rtol": 1e-2}}
 PUBLISHED = {
     "d1": 1e-3,
@@ -106,7 +105,8 @@ def main() -> None:
     columns = {"published": on_new_seeds(same, PUBLISHED), "best": on_new_seeds(same, best.values)}
     if narrow:
         columns[f"{finer:g} µm voxels"] = on_new_seeds(judged(finer), best.values)
-    print(f"\n{'on 8 new seeds':<18}" + "".join(f"{title:>14}" for title in columns))
+    print(f"\ncolonies of {COLONY['cells']} cells on 8 new seeds")
+    print(f"{'':<18}" + "".join(f"{title:>14}" for title in columns))
     for name in columns["best"]:
         print(f"{name:<18}" + "".join(f"{found[name]:>14.4g}" for found in columns.values()))
     for title in list(columns)[1:] if narrow else ():

@@ -57,6 +57,10 @@ def test_a_run_is_predicted_from_the_pace_of_growth():
     assert "no estimate: the probe did not grow" in tf.explain(
         tf.Scene(tf.Growth(rate=0.0)), seconds=0.01
     )
+    leaving = tf.Removal(low=(-9.0,) * 3, high=(9.0,) * 3)
+    open_box = tf.explain(tf.Scene(tf.Growth(rate=1.0), leaving), cells=1000, seconds=0.01)
+    words = "Cells leave, so that colonies may never be so large"
+    assert words in open_box and words not in said
 
 
 @pytest.mark.parametrize("when", ["a step", "a division"])

@@ -27,8 +27,9 @@ def _read_gate(records: Records, gate: Record) -> Gate:
     try:
         return read_gate(records, gate)
     except tf.InputError as error:
+        where = "" if str(error).startswith(gate.where) else f"{gate.where}: "
         raise tf.InputError(
-            f"{gate.where}: {error} Library.read(file, gates=(…)) reads the gates that are named,"
+            f"{where}{error} Library.read(file, gates=(…)) reads the gates that are named,"
             " without the others."
         ) from error
 

@@ -140,8 +140,8 @@ def test_methods_learn_what_is_known(method):
         ({"mke": 1.0}, "start = 'mke'.*a parameter of lit: make, decay"),
         ({"make": 99.0}, "make = 99.0"),
         (3, "start = 3.*values by name"),
-        ("no.json", "no.json cannot be read as a saved design"),
-        ("no.h5", "There is no such file"),
+        ("no.json", "start = 'no.json'.*a file that exists"),
+        ("no.h5", "start = 'no.h5'.*a file that exists"),
     ],
 )
 def test_bad_starts_are_refused(start, words):
@@ -162,6 +162,14 @@ def test_a_study_of_another_start_is_refused(tmp_path):
         search(start={"make": 2.0}).run(6, study=tmp_path / "s.h5", progress=False)
     with pytest.raises(tf.InputError, match="Different: start"):
         search().run(6, study=tmp_path / "s.h5", progress=False)
+
+
+def test_a_start_without_a_value_that_the_scene_needs_is_refused():
+    def bare(make):
+        return lit(make)
+
+    with pytest.raises(tf.InputError, match=r"start has no value for 'make'.*start={'make': …}"):
+        search([Parameter("make", 0.1, 10)], bare, start={})
 
 
 @pytest.mark.parametrize(

@@ -145,7 +145,8 @@ class Run:
             watch=self.watch,
             picture=self.picture,
             colour=colour,
-            full=Standstill(DEFAULT_CELLS, STILL) if unasked else None,
+            # sooner than simulate warns of a run that does not end
+            full=Standstill(DEFAULT_CELLS, STILL - LOOK) if unasked else None,
         )
 
     def _cells(self) -> Cells | None:
