@@ -14,8 +14,10 @@ from matplotlib.figure import Figure
 
 import torchfilm as tf
 from torchfilm.pictures import Frame, frame_of, outlines, scale_bar
+from torchfilm.pictures.colours import PlotStyle
 from torchfilm.pictures.draw import WALL, add_walls, set_window
 from torchfilm.pictures.frames import RecordedFrames
+from torchfilm.pictures.page import plan_layout
 
 
 def sheet(what, path: Path, **options) -> Path:
@@ -356,18 +358,45 @@ def test_walls_are_drawn_where_they_stand(tmp_path):
     floor, lid = tf.Plane(z=-0.5, facing="+z"), tf.Plane(z=2.0, facing="-z", stiffness=30.0)
     askew = tf.Plane(point=(3.0, 0.0, 0.0), normal=(-0.6, 0.8, 0.0))
     (above,) = walls_drawn(tmp_path, [floor, lid, askew], "xy")
-    assert len(above) == 1 and above[0].get_slope() is None and above[0].get_linestyle() == "-"
-    (x, y), (x2, y2) = above[0].get_xy1(), above[0].get_xy2()
-    assert (-0.6 * x + 0.8 * y, -0.6 * x2 + 0.8 * y2) == (
-        pytest.approx(-1.8),
-        pytest.approx(-1.8),
-    ) and (x, y) != (x2, y2)
+    assert len(above) == 1 and above[0].get_linestyle() == "-"
+    x, y = above[0].get_data()
+    assert np.abs(-0.6 * x + 0.8 * y + 1.8).max() < 1e-6 and np.hypot(*np.diff([x, y])) > 1e6
     (tmp_path / "run.h5").unlink()
     (side,) = walls_drawn(tmp_path, [floor, lid, askew], "xz")
-    assert [(line.get_xy1()[1], line.get_xy2()[1], line.get_linestyle()) for line in side] == [
+    assert [(*line.get_ydata(), line.get_linestyle()) for line in side] == [
         (-0.5, -0.5, "-"),
         (2.0, 2.0, "--"),
     ]
+
+
+def test_flat_walls_end_at_one_another(tmp_path):
+    """A channel that is closed at one end, a box, and a wall that lies behind another one."""
+    (channel,) = walls_drawn(tmp_path, [tf.Channel(width=4.0, low_end=-3.0)], "xy", dim=2)
+    sides = [line for line in channel if np.ptp(line.get_ydata()) == 0]
+    (end,) = [line for line in channel if line not in sides]
+    assert sorted(line.get_ydata()[0] for line in sides) == [-2.0, 2.0]
+    for line in sides:
+        assert min(line.get_xdata()) == -3.0 and max(line.get_xdata()) > 1e5
+    assert [*end.get_xdata(), *sorted(end.get_ydata())] == [-3.0, -3.0, -2.0, 2.0]
+    (tmp_path / "run.h5").unlink()
+    walls = [tf.Box((-4.0, -2.0), (4.0, 2.0)), tf.Plane(x=-5.0, facing="+x")]
+    (box,) = walls_drawn(tmp_path, walls, "xy", dim=2)
+    ends = sorted(tuple(map(sorted, (a.get_xdata(), a.get_ydata()))) for a in box)
+    assert ends == [
+        ([-4.0, -4.0], [-2.0, 2.0]), ([-4.0, 4.0], [-2.0, -2.0]), ([-4.0, 4.0], [2.0, 2.0]),
+        ([4.0, 4.0], [-2.0, 2.0]),
+    ]  # fmt: skip
+
+
+def test_colonies_between_walls_are_shown_at_one_place():
+    """Unless they are far from one another."""
+    wall = tf.Mechanics(dim=2, walls=[tf.Channel(width=4.0)])
+    for walls, apart, same in (([wall], 0.3, True), ([wall], 30.0, False), ([], 0.3, False)):
+        cells = tf.Cells([[0.0, 0.0], [apart, 0.0]], [[1.0, 0.0]] * 2, 4.0, colony=[0, 1])
+        scene = tf.Scene(tf.Growth(rate=1.0), *walls, founders=cells)
+        frame = frame_of(scene.bind().start(), scene)
+        windows = plan_layout([frame], [0, 1], PlotStyle()).windows
+        assert (windows[0] == windows[1]) == same
 
 
 def test_a_sheet_of_a_state_has_the_walls_that_the_picture_of_its_file_has(tmp_path):
@@ -399,8 +428,10 @@ def test_each_colonys_own_walls_are_drawn(tmp_path):
     ]
     first, second = walls_drawn(tmp_path, walls, "xy", dim=2, colonies=2)
     for drawn, half, radius in ((first, 2.0, 1.0), (second, 3.0, 2.0)):
-        assert sorted(abs(a.get_xy1()[1]) for a in drawn[:-1]) == [0.0, half, half]
-        assert drawn[-1].get_radius() == radius and tuple(drawn[-1].get_center()) == (5.0, 0.0)
+        (circle,) = [a for a in drawn if hasattr(a, "get_radius")]
+        ends = sorted(tuple(np.abs(a.get_ydata())) for a in drawn if a is not circle)
+        assert ends == [(half, half)] * 3
+        assert circle.get_radius() == radius and tuple(circle.get_center()) == (5.0, 0.0)
 
 
 def test_colonies_of_a_study_are_named_by_the_parameter_that_differs(tmp_path):

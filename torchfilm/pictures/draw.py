@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WALL = "#a0522d"  # not grey, so that it differs from a signal
+FAR = 1e6  # µm: the end of a wall that has none
 # the colour outside the box of a signal: not grey, so that nobody reads it as a concentration
 OUTSIDE_BOX = "#efe4d2"
 SMALL, TINY = 7.0, 6.0  # points
@@ -201,37 +202,51 @@ def add_cells(
 def add_walls(ax: Axes, walls: Sequence[Mapping[str, Any]], colony: int, view: str) -> None:
     """Draw the walls of the colony with this id behind its cells.
 
-    walls: as in `Results.walls`. Hard walls are lines, soft ones dashed lines. A flat wall that is
-    not perpendicular to the view is omitted.
+    walls: as in `Results.walls`. Hard walls are lines, soft ones dashed lines. A flat wall ends
+    where it is behind another one; one that is not perpendicular to the view is omitted.
     """
+    from matplotlib.lines import Line2D
     from matplotlib.patches import Circle
 
     for artist in [a for a in (*ax.lines, *ax.patches) if a.get_gid() == WALL]:
         artist.remove()
     own = lambda x: x[colony] if isinstance(x, list) else x
     seen = VIEWS[view]
+    style: Any = {"color": WALL, "linewidth": 0.8, "zorder": 0.5, "gid": WALL}
+    dashes = lambda wall: "--" if wall["soft"] else "-"
+    flat = []
     for wall in walls:
-        style: Any = {
-            "color": WALL,
-            "linewidth": 0.8,
-            "linestyle": "--" if wall["soft"] else "-",
-            "zorder": 0.5,
-            "gid": WALL,
-        }
         if "radius" in wall:
-            ax.add_patch(
-                Circle(
-                    tuple(own(wall["center"][k]) for k in seen),
-                    own(wall["radius"]),
-                    fill=False,
-                    **style,
-                )
-            )
+            center = tuple(own(wall["center"][k]) for k in seen)
+            round_wall = {"fill": False, "linestyle": dashes(wall), **style}
+            ax.add_patch(Circle(center, own(wall["radius"]), **round_wall))
             continue
-        u, v = (own(wall["normal"][k]) for k in seen)
-        if math.hypot(u, v) > 1.0 - 1e-6:
-            x, y = own(wall["offset"]) * u, own(wall["offset"]) * v
-            ax.axline((x, y), (x - v, y + u), **style)
+        normal = np.array([own(wall["normal"][k]) for k in seen])
+        if np.hypot(*normal) > 1.0 - 1e-6:
+            flat.append((normal, own(wall["offset"]), dashes(wall)))
+    for k, (normal, offset, dash) in enumerate(flat):
+        others = [(n, o) for j, (n, o, _) in enumerate(flat) if j != k]
+        if (ends := _ends(normal, offset, others)) is not None:
+            ax.add_artist(Line2D(*ends.T, linestyle=dash, **style))
+
+
+def _ends(
+    normal: np.ndarray, offset: float, others: Sequence[tuple[np.ndarray, float]]
+) -> np.ndarray | None:
+    """The ends (2, 2) of a flat wall between the others, µm; None where it is behind them. Walls
+    bound x · normal >= offset."""
+    foot, along_it = offset * normal, np.array([-normal[1], normal[0]])
+    low, high = -FAR, FAR
+    for n, o in others:
+        slope, inside = float(n @ along_it), float(n @ foot) - o
+        if abs(slope) < 1e-9:  # parallel
+            if inside < -1e-9:
+                return None
+        elif slope > 0:
+            low = max(low, -inside / slope)
+        else:
+            high = min(high, -inside / slope)
+    return None if low >= high else foot + np.outer([low, high], along_it)
 
 
 def scale_bar(ax: Axes) -> float:

@@ -43,6 +43,7 @@ EDGE, GAP, HEAD = 0.12, 0.07, 0.19  # margin, between panels, title of a panel
 # height of a legend with its ticks; of the scale bar; between two legends, for their end numbers
 BAR, BELOW, ROOM = 0.36, 0.24, 0.45
 LETTER = 0.056  # width of a letter of 7 points, about
+TOGETHER = 0.1  # how much larger a window of all colonies may be, as a share of its size
 
 
 def figure_class() -> Any:
@@ -119,12 +120,26 @@ def plan_layout(frames: Sequence[Frame], places: Sequence[int], style: PlotStyle
         if style.signal is None
         else scale_of(style.signal, seen[style.signal], style, frame.units, _where(frame, style))
     )
+    if any(frame.walls for frame in frames):
+        covered = _together(covered)
     return PanelLayout(style, places, _windows(places, covered, boxes, style), scales, behind)
 
 
 def _union(a: np.ndarray | None, b: np.ndarray) -> np.ndarray:
     """The smallest box around two boxes (2, 2); a may be None."""
     return b if a is None else np.stack([np.minimum(a[0], b[0]), np.maximum(a[1], b[1])])
+
+
+def _together(covered: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
+    """Between walls that all see, colonies at about the same place are shown at the same place:
+    their boxes (2, 2) become the one around them all, if that is little larger than the largest."""
+    if not covered:
+        return {}
+    boxes = np.stack(list(covered.values()))
+    all_of_them = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
+    largest = (boxes[:, 1] - boxes[:, 0]).max(0)
+    alike = bool((all_of_them[1] - all_of_them[0] <= TOGETHER * largest.max() + largest).all())
+    return {place: all_of_them if alike else own for place, own in covered.items()}
 
 
 def _windows(
