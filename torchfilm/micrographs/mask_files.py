@@ -54,7 +54,8 @@ def _one_frame(stack: np.ndarray, frame: int | None, source: str) -> tuple[np.nd
     if frame is None:
         if count != 1:
             raise checks.InputError(
-                f"{source} has {count} frames: say which one by frame=…, from 0 to {count - 1}."
+                f"{source} has {count} frames: say which one by frame=…, from 0 to {count - 1}. If"
+                " they are channels, give the array of one channel, such as tifffile.imread(…)[0]."
             )
         frame = 0
     elif isinstance(frame, bool) or not isinstance(frame, (int, np.integer)):
