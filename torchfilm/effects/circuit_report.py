@@ -22,7 +22,8 @@ class CircuitReport:
     steps: Tensor
     words: Mapping[int, str]
     hint = (
-        "A smaller dt, or rates that stay finite and do not push a concentration below 0, may help"
+        "Look at the signs of the rates (none may be below 0 where its species is 0), at their"
+        " units (per hour), and at whether they stay finite; a smaller dt may help"
     )
 
     def reason(self, place: int) -> str:
