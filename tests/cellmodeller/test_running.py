@@ -296,6 +296,90 @@ def test_asymm_and_other_random_numbers(tmp_path):
         grown(scene, until=1.0)
 
 
+def test_a_share_that_only_a_later_step_sets_is_not_used_either(tmp_path):
+    update = UPDATE.replace("cell.divideFlag = True", "cell.divideFlag = True; cell.asymm = [2, 1]")
+    text = HEAD + SETUP + INIT.replace("3 + random", "3.6 + random") + update + DIVIDE
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        scene = tf.from_cellmodeller(written(tmp_path, text), loop="cells")
+    with pytest.warns(UserWarning, match="cells divide in the middle"):
+        assert grown(scene, until=1.0).cells > 2
+
+
+KEEPS = """
+the_sim = None
+count = 0
+
+def setup(sim):
+    global the_sim
+    the_sim = sim
+    sim.init(CLBacterium(sim, jitter_z=False), ModuleRegulator(sim), None, None)
+    sim.addCell(cellType=0, pos=(0, 0, 0))
+
+def init(cell):
+    cell.targetVol, cell.growthRate, cell.n, cell.k = 3.5, 1.0, 0, 0
+
+def update(cells):
+    for id, cell in cells.items():
+        cell.n, cell.k = len(the_sim.cellStates), the_sim.stepNum
+        if the_sim.stepNum >= 40:
+            cell.growthRate = 0.0
+        if cell.volume > cell.targetVol:
+            cell.divideFlag = True
+"""
+
+
+@pytest.mark.filterwarnings(SLOW)
+def test_a_script_that_keeps_sim_reads_the_step_and_the_cells(tmp_path):
+    """Growth ends at step 40, in each of two colonies; also after a restart."""
+    scene = tf.from_cellmodeller(written(tmp_path, HEAD + KEEPS))
+    state = grown(scene, colonies=2)
+    assert state.k.tolist() == [59.0] * state.cells and not bool(state.growth_rate.any())
+    assert state.n.tolist() == torch.repeat_interleave(state.counts, state.counts).tolist()
+    assert state.counts.tolist() == [4, 4]
+    half = grown(scene, colonies=2, until=1.5)
+    *_, again = tf.simulate(scene.bind(state=half), half, until=3.0)
+    assert torch.equal(again.position, state.position) and torch.equal(again.k, state.k)
+
+
+@pytest.mark.parametrize(
+    "line, words",
+    [
+        ("the_sim.addCell(pos=(9, 0, 0))", "sim.addCell after setup"),
+        ("the_sim.dt = 0.1", "sim.dt = … after setup"),
+        ("the_sim.stepNum = 0", "sim.stepNum = … is not supported"),
+    ],
+)
+@pytest.mark.filterwarnings(SLOW)
+def test_what_cannot_be_set_up_later_is_refused(line, words, tmp_path):
+    text = HEAD + KEEPS + f"    if the_sim.stepNum == 3:\n        {line}\n"
+    scene = tf.from_cellmodeller(written(tmp_path, text))
+    with pytest.raises(tf.SimulationError, match=words):
+        grown(scene)
+
+
+def test_the_cells_are_known_in_update_only(tmp_path):
+    text = HEAD + KEEPS + "\ndef divide(parent, d1, d2):\n    d1.n = len(the_sim.cellStates)\n"
+    with pytest.raises(tf.InputError, match=r"sim\.cellStates is known in update\(cells\) only"):
+        tf.from_cellmodeller(written(tmp_path, text))
+
+
+@pytest.mark.filterwarnings(SLOW)
+def test_a_global_variable_that_one_function_changes_is_said_of_that_one(tmp_path):
+    text = HEAD + KEEPS.replace("    for id", "    global count\n    count += 1\n    for id")
+    text += "\ndef divide(parent, d1, d2):\n    d1.n = 0\n"
+    with pytest.warns(UserWarning, match=r"update\(cells\) changes the global") as caught:
+        grown(tf.from_cellmodeller(written(tmp_path, text)))
+    assert not any("divide(parent" in str(w.message) for w in caught)
+
+
+@pytest.mark.filterwarnings(SLOW)
+def test_a_negative_type_is_refused(tmp_path):
+    text = HEAD + KEEPS.replace("cell.n, cell.k = len", "cell.cellType = -1; cell.n, cell.k = len")
+    with pytest.raises(tf.SimulationError, match="cellType = -1: it must be a whole number from 0"):
+        grown(tf.from_cellmodeller(written(tmp_path, text), loop="cells"))
+
+
 def test_a_scene_is_known_again(tmp_path):
     """By what the script says, not by where it lies; and in another process."""
     scene = tf.from_cellmodeller(written(tmp_path, GROWS))

@@ -14,7 +14,7 @@ from torchfilm.cellmodeller.cell import Cell
 from torchfilm.cellmodeller.columns import Uneven
 from torchfilm.cellmodeller.globals_watch import GlobalsWatch
 from torchfilm.cellmodeller.loading import INNER_IMPORT, importing
-from torchfilm.cellmodeller.sheets import first_fields, sheet_of, with_written
+from torchfilm.cellmodeller.sheets import SHARES, first_fields, sheet_of, with_written
 from torchfilm.cellmodeller.variables import HISTORY
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.state import Births, Field, State
@@ -34,7 +34,7 @@ class _Bound(BoundEffect):
         super().__init__(effect, binding)
         self.script, self.layout = effect.script, effect.layout
         self.history = [n for n in HISTORY if n in self.layout.variables]
-        self.watch = GlobalsWatch(self.script.module)
+        self.script.watch = GlobalsWatch(self.script.module)
 
     def reads(self) -> tuple[str, ...]:
         return (
@@ -61,6 +61,7 @@ class _Bound(BoundEffect):
     @contextmanager
     def running(self, doing: str, state: State, starting: bool = False) -> Iterator[None]:
         """Errors of the script with their line, and its global variables watched."""
+        self.script.sim._at(state.step)
         try:
             with draws.kept(), self._imports(), self.script.errors(doing):
                 yield
@@ -68,11 +69,12 @@ class _Bound(BoundEffect):
             if starting:
                 raise
             raise SimulationError(str(error)) from error
-        changed = self.watch.changed()
+        assert self.script.watch is not None
+        changed = self.script.watch.changed()
         if not changed:
             return
         names = ", ".join(changed)
-        self.watch = GlobalsWatch(self.script.module)
+        self.script.watch = GlobalsWatch(self.script.module)
         if state.colonies > 1:
             raise SimulationError(
                 f"{self.script.path.name}: {doing} changes the global variable {names}, which all"
@@ -169,6 +171,7 @@ class BoundScript(_Bound):
                 start += count
                 if mine:
                     draws.seed(state.seed, stream, state.step, "update")
+                    self.script.sim._at(state.step, dict(mine))
                     _call_on(update, mine)
             state, dead = with_written(state, self.layout, sheet, cells)
         return state if dead is None else state.remove(dead, "removed")
@@ -220,10 +223,7 @@ class ScriptDivision(_Bound):
         if share is not None and share.shape == (2,):
             one, other = parents.fields[share.field].unbind(1)
             if bool((one - other).abs().gt(0).any()):
-                warn(
-                    "the script sets cell.asymm, which CellModeller's CLBacterium does not use:"
-                    " cells divide in the middle, here as well."
-                )
+                warn(SHARES)
 
     def _daughters(self, state: State, rows: Tensor) -> State:
         """What CellModeller resets in daughters."""

@@ -17,6 +17,7 @@ from types import ModuleType
 from typing import Any
 
 from torchfilm.cellmodeller import draws, stand_ins
+from torchfilm.cellmodeller.globals_watch import GlobalsWatch
 from torchfilm.cellmodeller.time_limit import TooLong, time_limit
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
@@ -34,17 +35,19 @@ OLD = re.compile(r"^\s*print\s+[^(\s=]", re.MULTILINE)
 
 @dataclass
 class Script:
-    """A script that has been set up. text: its source. request: what it asked for. dt: h. helpers:
-    modules that it imports from its folder, which no other script sees. seconds: that it may take
-    to be set up, and each function in its rehearsal."""
+    """A script that has been set up. text: its source. request: what it asked for, of sim. dt: h.
+    helpers: modules that it imports from its folder, which no other script sees. seconds: that it
+    may take to be set up, and each function in its rehearsal."""
 
     path: Path
     text: str
     module: ModuleType
     request: stand_ins.Request
+    sim: stand_ins.Simulator
     dt: float
     seconds: float = SECONDS
     helpers: dict[str, ModuleType] = field(default_factory=dict)
+    watch: GlobalsWatch | None = None  # of a run
 
     def function(self, name: str) -> Callable[..., Any] | None:
         found = getattr(self.module, name, None)
@@ -114,9 +117,9 @@ def load(path: Path, seconds: float = SECONDS) -> Script:
     module = ModuleType(path.stem)
     module.__file__ = str(path)
     request = stand_ins.Request()
-    script = Script(path, text, module, request, stand_ins.DT, seconds)
-    code = _compiled(path, text)
     sim = stand_ins.Simulator(request, module)
+    script = Script(path, text, module, request, sim, stand_ins.DT, seconds)
+    code = _compiled(path, text)
     with draws.kept(), importing(script), script.errors("loading"):
         draws.seed("load")
         with script.limited(), redirect_stdout(sys.stderr):
@@ -131,6 +134,7 @@ def load(path: Path, seconds: float = SECONDS) -> Script:
             " only with the functions of random and numpy.random."
         )
     script.dt = checks.number("sim.dt", sim.dt, above=0.0)
+    sim._at(0)
     return script
 
 

@@ -37,7 +37,9 @@ def rehearse(script: Script, bare: Layout, founders: Cells) -> tuple[Layout, Sta
     with draws.kept(), importing(script):
         seen = [_rehearsed(script, "init", [[c] for c in everyone], everyone)]
         first = [copy.deepcopy(cell.__dict__) for cell in everyone]
+        script.sim._at(0, cells)
         seen.append(_rehearsed(script, "update", [[cells]], everyone))
+        script.sim._at(0)
         if script.function("divide") is not None:
             family = [_copied(everyone[0]) for _ in range(3)]
             seen.append(_rehearsed(script, "divide", [family], family))

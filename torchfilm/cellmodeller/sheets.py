@@ -19,6 +19,10 @@ from torchfilm.tools.checks import InputError
 from torchfilm.tools.warn_once import warn
 
 TOUCHING = 0.05  # µm between surfaces of neighbours
+SHARES = (
+    "the script sets cell.asymm, which CellModeller's CLBacterium does not use: cells divide in the"
+    " middle, here as well."
+)
 
 
 @dataclass(frozen=True)
@@ -214,6 +218,8 @@ def with_written(
             put(known.field, at, known.column(given))
         elif name in READ_ONLY:
             _warn_ignored(name)
+        elif name == "asymm":
+            warn(SHARES)
         else:
             raise InputError(
                 f"cell.{name} is set for the first time after the start: set it in init(cell) as"
@@ -227,8 +233,8 @@ def _plain(name: str, given: Sequence[Any]) -> np.ndarray:
     made = np.asarray(given)
     if made.ndim != 1 or made.dtype.kind not in "biuf":
         raise InputError(f"cell.{name} = {given[0]!r} is not supported: it must be one number.")
-    if name == "cellType" and (made != np.round(made)).any():
-        raise InputError(f"cell.cellType = {given[0]!r}: it must be a whole number.")
+    if name == "cellType" and ((made != np.round(made)) | (made < 0)).any():
+        raise InputError(f"cell.cellType = {given[0]!r}: it must be a whole number from 0.")
     if name == "growthRate":
         check_growth(torch.as_tensor(made))
     return made

@@ -58,28 +58,49 @@ class _Recorder:
 
 
 class Simulator(_Recorder):
-    """`sim`, as `setup(sim)` gets it."""
+    """`sim`, as `setup(sim)` gets it. Scripts may keep it, and read `stepNum` and `cellStates`."""
 
     _title = "sim"
+    # what may be set; the first group also after setup(sim), where it changes nothing
+    _idle = (
+        "pickleSteps", "saveOutput", "outputDirName", "outputDirPath", "renderers", "is_gui",
+    )  # fmt: skip
     _settable = (
-        "dt", "pickleSteps", "saveOutput", "outputDirName", "outputDirPath", "stepNum", "renderers",
-        "moduleName", "moduleStr", "module", "is_gui", "cellStates", "phys", "reg", "sig", "integ",
+        *_idle, "dt", "moduleName", "moduleStr", "module", "phys", "reg", "sig", "integ",
     )  # fmt: skip
 
     def __init__(self, request: Request, module: ModuleType):
-        self._request = request
+        self._request, self._running, self._step = request, False, 0
+        self._cells: dict[int, Any] | None = {}
         self.module, self.moduleName, self.moduleStr = module, module.__name__, None
-        self.dt, self.stepNum, self.is_gui = DT, 0, False
+        self.dt, self.is_gui = DT, False
         self.pickleSteps, self.saveOutput = 50, False
         self.outputDirName = self.outputDirPath = None
-        self.cellStates: dict[int, Any] = {}
         self.renderers: list[Any] = []
         self.phys = self.reg = self.sig = self.integ = None
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name not in self._settable and not name.startswith("_"):
             raise InputError(f"sim.{name} = … is not supported by torchfilm.")
+        if name in self._settable and name not in self._idle and self.__dict__.get("_running"):
+            raise InputError(f"sim.{name} = … after setup(sim) is not supported by torchfilm.")
         self.__dict__[name] = value
+
+    @property
+    def stepNum(self) -> int:
+        """Steps that are over."""
+        return self._step
+
+    @property
+    def cellStates(self) -> dict[int, Any]:
+        """In `update(cells)`, these cells."""
+        if self._cells is None:
+            raise InputError("sim.cellStates is known in update(cells) only.")
+        return self._cells
+
+    def _at(self, step: int, cells: dict[int, Any] | None = None) -> None:
+        """What scripts read from now on; they can set up no more."""
+        self._running, self._step, self._cells = True, step, cells
 
     def init(self, phys: Any, reg: Any, sig: Any = None, integ: Any = None) -> None:
         for given, kind, name in (
@@ -109,6 +130,8 @@ class Simulator(_Recorder):
     ) -> None:
         if not self._request.started:
             raise InputError("sim.addCell before sim.init: CellModeller has no models to add to.")
+        if self._running:
+            raise InputError("sim.addCell after setup(sim) is not supported by torchfilm.")
         cell: dict[str, Any] = {n: given.pop(n) for n in ("pos", "dir", "rad") if n in given}
         self._request.cells.append({"cellType": cellType, "length": length, **cell})
         self._request.ignored += [
