@@ -95,7 +95,9 @@ class Best:
         assert found is not None
         first = self.objective.task.space.values(found)
         rows = report.parameter_rows(self.objective.task.space, first, self.values)
-        losses: list[tuple[str, str]] = [("loss in the search", f"{self.searched_loss:.4f}")]
+        losses: list[tuple[str, str]] = [
+            ("loss in the search", report.show_loss(self.searched_loss))
+        ]
         if self.fresh is not None:
             losses.append(
                 ("loss on fresh seeds", report.fresh_words(self.objective.task, self.fresh))

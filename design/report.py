@@ -19,6 +19,7 @@ from design.task import Task
 from design.trivial import EVERY_SECOND, trivial_losses
 
 WORST = 3  # statistics that a poor fit names
+LARGE = 1e5  # a loss of which decimals say nothing
 LUCKY = 0.8  # of the band on fresh seeds: a search that saw less than this was misled
 SUCCESS = 0.25  # of the loss of the best trivial answer: as in the comparison of methods
 FITS = 2.0  # a greater loss is not that of colonies like the observed ones, which is about 1
@@ -58,10 +59,10 @@ def table(report: SearchReport) -> str:
     first, best, study = report.first, report.best, report.study
     rows: list[tuple[str, ...]] = [("parameter", "bounds", first.title, best.title, "")]
     rows += parameter_rows(report.task.space, first.values, best.values)
-    rows.append((_loss_title(report), "", f"{first.loss:.4f}", f"{best.loss:.4f}", ""))
+    rows.append((_loss_title(report), "", show_loss(first.loss), show_loss(best.loss), ""))
     rows += _goals(report)
     if best.fresh is not None:
-        title, loss = f"{_loss_title(report)} on fresh seeds", f"{best.fresh.loss:.4f}"
+        title, loss = f"{_loss_title(report)} on fresh seeds", show_loss(best.fresh.loss)
         rows.append((title, "", "", loss, _seeds(report.task, best.fresh)))
     rows.append(("cells", "", *(cells_in(design.colonies) for design in (first, best)), ""))
     target = report.task.target
@@ -127,7 +128,12 @@ def parameter_rows(
 
 def fresh_words(task: Task, fresh: FreshLosses) -> str:
     """The loss on fresh seeds, with its band."""
-    return f"{fresh.loss:.4f} ({_seeds(task, fresh)})"
+    return f"{show_loss(fresh.loss)} ({_seeds(task, fresh)})"
+
+
+def show_loss(loss: float) -> str:
+    """Four decimals, but of what is as large as the loss of a failed colony."""
+    return f"{loss:.4f}" if abs(loss) < LARGE else f"{loss:.4g}"
 
 
 def _seeds(task: Task, fresh: FreshLosses) -> str:
@@ -135,7 +141,7 @@ def _seeds(task: Task, fresh: FreshLosses) -> str:
     if task.worst:  # no band tells what lies beyond the worst of some seeds; their order does
         return f"the worst of {seeds} seeds; 1 new seed in {seeds + 1} is worse"
     low, high = fresh.band
-    return f"{low:.4f} … {high:.4f}, {seeds} seeds"
+    return f"{show_loss(low)} … {show_loss(high)}, {seeds} seeds"
 
 
 def _loss_title(report: SearchReport) -> str:

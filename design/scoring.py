@@ -197,9 +197,8 @@ def _grow_and_score(
                 continue
             ids = [k // copies for k in event.state.colony_id.tolist()[::copies]]
             score = _scores(task.target, event)[::copies]
-            for k, number in zip(ids, score.tolist(), strict=True):
-                if not math.isfinite(number):
-                    reasons[divmod(k, replicates)] = f"the target's loss was {number}"
+            score, why = _below_failed(task.target, score)
+            reasons |= {divmod(ids[k], replicates): words for k, words in why.items()}
             unfit = _unfit(task, event.state, size)[::copies]
             reasons |= {divmod(k, replicates): w for k, w in zip(ids, unfit, strict=True) if w}
             good = np.isfinite(score) & np.array([not why for why in unfit])
@@ -216,6 +215,22 @@ def _grow_and_score(
         losses.reshape(shape), cells.reshape(shape), reasons, prepared.why_regrown, slopes,
         goals.reshape(*shape, task.goals),
     )  # fmt: skip
+
+
+def _below_failed(target: Target, score: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:
+    """Losses (n,) that a search can compare, NaN for the others, and why, by their places: a colony
+    that grew must not look worse than one that failed."""
+    why = {}
+    for k, number in enumerate(score.tolist()):
+        if not math.isfinite(number):
+            why[k] = f"the target's loss was {number}"
+        elif number > target.failed:
+            why[k] = (
+                f"the target's loss was {number:g}, above {target.failed:g}, that of a failed"
+                f" colony. Give {type(target).__name__} a class attribute `failed` above all its"
+                " losses"
+            )
+    return np.where([k in why for k in range(len(score))], np.nan, score), why
 
 
 def _unfit(task: Task, state: tf.State, size: float) -> list[str]:

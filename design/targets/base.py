@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 # "out.ahl" is the signal at the cell; "ahl" is the level inside the cell
 OUTSIDE = "out."
+# The loss of a failed colony: where losses have no upper limit, and where they end at 1.
+WORST, FAILED = 1e9, 1.5
 # A target may read these, and what serves the numerics, but they are none to offer.
 OF_DIVISION = ("division_threshold", "birth_length")
 
@@ -26,13 +28,13 @@ class Target(metaclass=checks.KnownKeywords):
     """A pattern that a colony should have. The ready targets are frozen dataclasses that check
     their parameters when they are made.
 
-    The loss of a colony is a number: 0 is perfect and, for the ready targets, 1 is the worst; a
-    colony that failed scores `failed`. It depends on the cells of that colony alone, not on its
-    batch. It has gradients with respect to the levels in the cells, but not to places, types and
-    volumes.
+    The loss of a colony is a number: 0 is perfect and, for most ready targets, 1 is the worst. A
+    colony that failed scores `failed`; so does one whose loss is above that, which counts as a
+    failure. The loss depends on the cells of that colony alone, not on its batch. It has gradients
+    with respect to the levels in the cells, but not to places, types and volumes.
     """
 
-    failed: ClassVar[float] = 1.5
+    failed: ClassVar[float] = WORST
     fewest: ClassVar[int] = 1  # cells: a smaller colony is not scored
     # whether answers without a pattern, such as evenly lit cells, say what a loss is worth
     pattern: ClassVar[bool] = True

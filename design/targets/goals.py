@@ -11,12 +11,20 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import Target, ratio, require, species_names, total, valid_levels, weights
+from design.targets.base import (
+    WORST,
+    Target,
+    ratio,
+    require,
+    species_names,
+    total,
+    valid_levels,
+    weights,
+)
 from design.targets.several import Several
 from torchfilm import checks
 
 CONCENTRATION = "conc"  # the unit of species
-WORST = 1e4  # the loss of a failed colony where a loss has no upper limit
 
 
 @dataclass(frozen=True)
@@ -27,7 +35,6 @@ class Burden(Target):
     species: by default all species of all circuits.
     """
 
-    failed = WORST
     species: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -63,8 +70,6 @@ class Burden(Target):
 @dataclass(frozen=True)
 class Duration(Target):
     """The hours that a colony takes to its end: for scenes in which the design sets the pace."""
-
-    failed = WORST
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         hours = float(state.time)
@@ -206,6 +211,13 @@ class Constrained(Several):
         for bounds in (self.at_least, self.at_most):
             for name, bound in bounds.items():
                 checks.number(f"Constrained: the bound of {name!r}", bound)
+        for name, least in self.at_least.items():
+            if name in self.at_most and least > self.at_most[name]:
+                raise checks.input_error(
+                    "Constrained",
+                    f"{name} ≥ {least:g} and ≤ {self.at_most[name]:g}",
+                    "bounds that one design can meet",
+                )
         object.__setattr__(self, "parts", parts)
 
     @property

@@ -11,7 +11,16 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import Target, ratio, require, species_name, total, valid_levels, weights
+from design.targets.base import (
+    FAILED,
+    Target,
+    ratio,
+    require,
+    species_name,
+    total,
+    valid_levels,
+    weights,
+)
 from design.targets.patterns import FOUND, TARGET
 from torchfilm import checks
 
@@ -43,6 +52,7 @@ class Oscillation(Target):
     a population whose phases have spread is small.
     """
 
+    failed = FAILED
     species: str
     period: float
     _: KW_ONLY

@@ -11,6 +11,7 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import (
+    FAILED,
     Target,
     ratio,
     require,
@@ -51,6 +52,7 @@ class DomainSize(Target):
     whose states are random.
     """
 
+    failed = FAILED
     species: tuple[str, str]
     size: float
 
@@ -153,6 +155,7 @@ class OnFraction(Target):
     on or off.
     """
 
+    failed = FAILED
     anywhere = True
     species: str
     fraction: float

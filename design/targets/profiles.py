@@ -14,6 +14,7 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import (
+    FAILED,
     Target,
     contrast,
     ratio,
@@ -79,6 +80,7 @@ class ProfileTarget(Target):
     """
 
     floor: float
+    failed = FAILED
     fewest = 10
 
     @property

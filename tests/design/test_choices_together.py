@@ -11,7 +11,7 @@ import torch
 from searching import DT, Level, filling, objective_of
 
 import torchfilm as tf
-from design import Choice, Parameter, Search, Sobol, Space, UnfitDesign
+from design import Choice, Parameter, Search, Sobol, Space, Target, UnfitDesign
 
 STRENGTH = {"weak": 1.0, "middle": 2.0, "strong": 4.0}
 CALLS: list[int] = []
@@ -57,9 +57,9 @@ def test_an_unfit_design_fails_with_its_reason_and_does_not_cut_the_batch():
     points = np.array([[0.1, 0.0], [0.5, 0.0], [0.9, 0.0], [0.5, 1.0], [0.2, 1.0]])
     CALLS.clear()
     found = objective.evaluate(points)
-    assert found.losses[1].tolist() == [1.5, 1.5]
+    assert found.losses[1].tolist() == [Target.failed] * 2
     assert found.reasons == {(1, k): "middle decays too slowly." for k in range(2)}
-    assert np.isfinite(found.loss).all() and (found.loss[[0, 2, 3, 4]] < 1.5).all()
+    assert np.isfinite(found.loss).all() and (found.loss[[0, 2, 3, 4]] < Target.failed).all()
     assert 8 in CALLS  # four fit designs with two replicates each
 
 

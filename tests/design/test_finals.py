@@ -189,7 +189,9 @@ def test_the_worst_of_few_seeds_does_not_win(reduce):
 def test_a_design_that_always_fails_does_not_win():
     """The band of the other ends above the loss of a failure."""
     task = search().objective.task
-    study, points = study_of(task, [np.full(4, 1.5), np.array([0.1, 1.5, 1.5, 1.5])])
+    study, points = study_of(
+        task, [np.full(4, Target.failed), np.array([0.1, *[Target.failed] * 3])]
+    )
     assert winner(task, study, (1.0,))[0] == points[1]
 
 

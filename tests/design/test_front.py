@@ -285,7 +285,7 @@ def test_a_weighted_sum_is_one():
     target = Weighted(parts)
     assert torch.allclose(target.loss(state), wanted)
     assert set(target.measures(state)) == {"mean_level", "burden"} and target.names == ("gfp",)
-    assert target.failed == 2.0 * 1.5 + 0.5 * Burden.failed
+    assert target.failed == 2.0 * Level.failed + 0.5 * Burden.failed
 
 
 def test_constraints_come_before_the_loss():
@@ -317,7 +317,7 @@ def test_a_design_whose_seeds_all_fail_is_not_alike_on_all():
     entry = made.study.entries[0]
     failed = {row for row, _ in entry.reasons}
     assert 0 < len(failed) < 8 and best.loss < 0.5
-    assert all((entry.loss[k] == 1.5) == (k in failed) for k in range(8))
+    assert all((entry.loss[k] == Level.failed) == (k in failed) for k in range(8))
 
 
 def test_the_band_and_the_slopes_of_a_spread_are_its_own():

@@ -85,14 +85,14 @@ def test_every_second_cell_lit_is_no_trivial_answer_to_a_share_of_lit_cells():
 def test_seeds_that_all_break_a_constraint_are_not_alike_but_broken():
     """Their losses hardly differ, and a spread of 0 would be the best there is."""
     spread = Spread(Constrained(Level(), at_least={"mean_level": 1.0}))
-    broken, held = [1e4 + 0.5, 1e4 + 0.5], [0.2, 0.4]
-    found = spread.reduced(np.array([broken, held, [0.2, 1e4 + 0.1]]))
+    broken, held = [1e9 + 0.5, 1e9 + 0.5], [0.2, 0.4]
+    found = spread.reduced(np.array([broken, held, [0.2, 1e9 + 0.1]]))
     assert (found[[0, 2]] >= Constrained.BROKEN).all() and found[1] < 1.0
 
 
 def test_large_losses_that_meet_the_constraints_are_not_called_broken():
-    target = Constrained(Burden(), at_most={"burden": 1e6})
-    lots = lambda make: lit(make=1e4 * make, decay=0.5)
+    target = Constrained(Burden(), at_most={"burden": 1e9})
+    lots = lambda make: lit(make=1e9 * make, decay=0.5)
     made = Search(lots, [Parameter("make", 1.0, 2.0)], target, cells=3, replicates=2)
     best = made.run(colonies=60, progress=False)
     assert best.losses.sum() > Constrained.BROKEN > best.losses.max()

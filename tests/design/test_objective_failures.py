@@ -3,15 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
 import torch
 from scored import alike, objective
-from searching import DT, Level, Spread, banned, fragile, grown, objective_of, paced, short, spots
+from searching import (
+    DT,
+    Level,
+    Spread,
+    banned,
+    fragile,
+    grown,
+    lit,
+    mean,
+    objective_of,
+    paced,
+    short,
+    spots,
+)
 
 import torchfilm as tf
-from design import Lasting, Parameter, Ring, Target, Weighted, growing, scoring
+from design import Burden, Lasting, Parameter, Ring, Target, UnfitDesign, Weighted, growing, scoring
 from design.derivatives import along
 from design.growing import FinishedColonies
 
@@ -30,12 +44,12 @@ def test_a_design_that_the_scene_refuses_fails_alone(most):
     )
     points = np.array([[0.3, 0.5], [0.1, 0.5], [0.25, 0.0], [0.9, 1.0]])
     found = made.evaluate(points)
-    assert (found.losses[[0, 2]] == 1.5).all() and (found.cells[[0, 2]] == 0).all()
+    assert (found.losses[[0, 2]] == Target.failed).all() and (found.cells[[0, 2]] == 0).all()
     assert set(found.reasons) == {(0, 0), (0, 1), (2, 0), (2, 1)}
     assert all("low ≤ high" in words for words in found.reasons.values())
     assert (
         np.array_equal(found.losses[[1, 3]], made.evaluate(points[[1, 3]]).losses)
-        and (found.losses[[1, 3]] != 1.5).all()
+        and (found.losses[[1, 3]] != Target.failed).all()
     )
     assert made.colonies(points[0]) == []
 
@@ -48,12 +62,15 @@ def test_rates_that_are_not_finite_fail_with_time_and_cell(replay):
     )
     points = np.array([[0.1], [0.9], [0.3]])
     found = made.evaluate(points)
-    assert found.losses[1].tolist() == [1.5, 1.5] and set(found.reasons) == {(1, 0), (1, 1)}
+    assert found.losses[1].tolist() == [Target.failed] * 2 and set(found.reasons) == {
+        (1, 0),
+        (1, 1),
+    }
     for words in found.reasons.values():
         assert words.startswith("at 0.2 h: circuit of cell 0: ") and "gfp" in words
     assert (
         np.array_equal(found.losses[[0, 2]], made.evaluate(points[[0, 2]]).losses)
-        and (found.losses[[0, 2]] != 1.5).all()
+        and (found.losses[[0, 2]] != Target.failed).all()
     )
     assert (
         len(made.colonies(points[1])) == 0
@@ -64,7 +81,7 @@ def test_rates_that_are_not_finite_fail_with_time_and_cell(replay):
 def test_a_division_too_short_fails_with_time_and_cell():
     made = objective_of(short, [Parameter("added", 0.2, 3)], Spread(), cells=6, replicates=1)
     found = made.evaluate(np.array([[0.0], [0.7]]))
-    assert found.losses[0, 0] == 1.5 and found.cells[0, 0] == 0 and found.cells[1, 0] >= 6
+    assert found.losses[0, 0] == Target.failed and found.cells[0, 0] == 0 and found.cells[1, 0] >= 6
     assert found.reasons == {(0, 0): found.reasons[0, 0]}
     assert "h: cell 0 is due to divide at length 0.5" in found.reasons[0, 0]
 
@@ -128,7 +145,7 @@ def test_a_colony_without_cells_fails():
     found = objective_of(
         dying, [Parameter("rate", 0.5, 1)], Spread(), cells=8, replicates=1
     ).evaluate(np.array([[1.0]]))
-    assert found.losses.tolist() == [[1.5]] and found.reasons[0, 0].startswith(
+    assert found.losses.tolist() == [[Target.failed]] and found.reasons[0, 0].startswith(
         "no cells remain at "
     )
 
@@ -218,7 +235,7 @@ def test_cells_that_do_not_grow_reach_an_end_in_time(monkeypatch):
     found = objective_of(
         resting, [Parameter("make", 0.5, 2.0)], Level(), until=5.0, replicates=1
     ).evaluate(np.array([[0.5]]))
-    assert not found.reasons and found.loss[0] < 1.5
+    assert not found.reasons and found.loss[0] < Target.failed
 
 
 def test_the_end_must_exceed_the_founders():
@@ -236,3 +253,39 @@ def test_the_end_must_exceed_the_founders():
         replicates=1,
     )
     assert small.task.end(0.01)[0] == 3 and not small.evaluate(np.array([[0.5]]), size=0.01).reasons
+
+
+@dataclasses.dataclass(frozen=True)
+class Far(Target):
+    """The square of how far the mean level is from 200, in units in which it is far."""
+
+    names = ("gfp",)
+
+    def loss(self, state, history=None):
+        return (mean(state, "gfp").double() - 200.0) ** 2
+
+
+class FarWithoutRoom(Far):
+    failed = 1.5
+
+
+@pytest.mark.parametrize("target", [Far(), FarWithoutRoom(), Burden()])
+def test_a_colony_that_grew_never_looks_worse_than_one_that_failed(target):
+    """The scene refuses the second design."""
+
+    def frail(make):
+        if bool((torch.as_tensor(make) > 3).any()):
+            raise UnfitDesign("too much")
+        return lit(1e5 * torch.as_tensor(make) if isinstance(target, Burden) else make)
+
+    found = objective_of(frail, [Parameter("make", 0.1, 10.0)], target, cells=3).evaluate(
+        np.array([[0.1], [0.9]])
+    )
+    assert "too much" in found.reasons[1, 0] and found.losses[1, 0] == target.failed
+    if type(target) is FarWithoutRoom:
+        words = (
+            r"loss was [\d.e+]+, above 1.5, that of a failed colony. Give FarWithoutRoom a class"
+        )
+        assert re.search(words, found.reasons[0, 0]) and found.loss[0] == found.loss[1]
+    else:
+        assert (0, 0) not in found.reasons and found.loss[0] < found.loss[1]

@@ -198,16 +198,16 @@ def test_what_failed_is_left_out_of_the_picture_and_the_table(tmp_path):
     broken = searched(
         fragile, [Parameter("make", 1, 10)], Level(), method=Given([0.9], [0.2]), cells=6
     )
-    assert broken.search.first().loss == 1.5 and broken.losses[0] != 1.5
+    assert broken.search.first().loss == Target.failed and broken.losses[0] != Target.failed
     refused = searched(
         banned,
         [Parameter("low", 3.0, 4.0), Parameter("make", 1, 2)],
         Level(),
         method=Given([0.3, 0.5], [0.1, 0.5]),
     )
-    assert refused.search.first().loss == 1.5
+    assert refused.search.first().loss == Target.failed
     for best in (broken, refused):
-        assert rows(best)["mean_level"][1] == "nan" and rows(best)["loss"][1] == "1.5000"
+        assert rows(best)["mean_level"][1] == "nan" and rows(best)["loss"][1] == "1e+09"
         assert coloured(pictured(best, tmp_path / "best.png")) > 0.01
 
 
@@ -221,7 +221,7 @@ def test_a_picture_is_drawn_where_every_design_failed(tmp_path):
         method=Given([0.9], [0.8]),
         cells=6,
     )
-    assert best.loss == 1.5 and best.colonies() == []
+    assert best.loss == Target.failed and best.colonies() == []
     assert pictured(best, tmp_path / "best.png").size and "4 colonies" in best.table()
 
 
