@@ -149,14 +149,15 @@ def test_a_signal_whose_amount_breaks_is_distinguished():
     with pytest.raises(
         InputError, match=r"gives -inf for the signal 'a' at the start \(a = 1, b = 0\)"
     ):
-        try_circuit(made, start)
+        try_circuit(made, start, made)
 
 
 def test_the_trial_tells_what_is_given():
     start = torch.ones(3, 2, dtype=F64)
-    assert try_circuit(circuit(), start) == ("a",)
-    assert try_circuit(circuit(lambda u, s, p, cell: {"a": -u.a}), start) == ()
-    assert try_circuit(circuit(lambda u, s, p, cell: ({"a": -u.a}, {})), start) == ()
+    assert try_circuit(circuit(), start, circuit()) == ("a",)
+    for rates in (lambda u, s, p, cell: {"a": -u.a}, lambda u, s, p, cell: ({"a": -u.a}, {})):
+        made = circuit(rates)
+        assert try_circuit(made, start, made) == ()
 
 
 def test_rates_may_be_numbers():

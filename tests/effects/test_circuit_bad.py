@@ -128,6 +128,19 @@ AT_SEED = {
         lambda u, s, p, cell: {"m": -u.m.sum()},
         r"depends on what other cells there are",
     ),
+    "the greatest of all cells": (
+        lambda u, s, p, cell: {"m": 1.0 + cell.x.max() - u.m},
+        r"depends on what other cells there are",
+    ),
+    "the last cell": (lambda u, s, p, cell: {"m": u.m[-1] - u.m}, r"what other cells there are"),
+    "the first cell": (
+        lambda u, s, p, cell: {"m": torch.where(cell.length > cell.length[0], 1.0, 0.0)},
+        r"depends on what other cells there are",
+    ),
+    "a sum above a level": (
+        lambda u, s, p, cell: {"m": torch.relu(u.m - 2.0).sum()},
+        r"depends on what other cells there are",
+    ),
     "no number": (lambda u, s, p, cell: {"m": "fast"}, r"shape str for the species 'm'"),
     "no dict": (lambda u, s, p, cell: u.m, r"returned Tensor: it must return a dict"),
     "NaN at the start": (

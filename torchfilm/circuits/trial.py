@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -13,22 +15,23 @@ from torchfilm.tools.checks import InputError
 
 
 def try_circuit(
-    circuit: CircuitCells, concentrations: Tensor, derivatives: bool = False
+    circuit: CircuitCells, concentrations: Tensor, unlike: CircuitCells, derivatives: bool = False
 ) -> tuple[str, ...]:
     """Calls the circuit once at concentrations (M, S), with derivatives if its method needs them.
+    unlike: as many cells that differ from one another.
 
     Returns the names of the signals that it exchanges. Raises InputError for wrong return values.
     """
     try:
         inside, outside = circuit.changes(concentrations, circuit.rows)
-        # small amounts, different in every cell: at 0, a sum over cells would go unnoticed
-        some = concentrations + 0.1 * torch.arange(
-            1, len(concentrations) + 1, device=concentrations.device
+        # amounts from small to large, different in every cell: among cells that are alike, or at
+        # 0, a sum over cells, or a look at one of them, would go unnoticed
+        count = len(concentrations)
+        some = concentrations + 10.0 ** torch.linspace(
+            -1.0, 1.0, count, dtype=concentrations.dtype, device=concentrations.device
         ).unsqueeze(1)
-        crowd, alone = (
-            circuit.changes(some, circuit.rows),
-            circuit.changes(some[:1], circuit.rows[:1]),
-        )
+        crowd = unlike.changes(some, unlike.rows)
+        alone = [unlike.changes(some[k : k + 1], unlike.rows[k : k + 1]) for k in (0, count - 1)]
         if derivatives:
             with torch.enable_grad():
                 circuit.changes(some.detach().clone().requires_grad_(), circuit.rows)
@@ -43,16 +46,9 @@ def try_circuit(
             " and the like rather than math or numpy, torch.where rather than if, and change"
             " nothing in place."
         ) from error
-    for whole, one in zip(crowd, alone, strict=True):
-        for name, value in one.items():
-            if not torch.allclose(
-                whole[name].detach()[:1], value.detach(), rtol=1e-4, atol=1e-30, equal_nan=True
-            ):
-                raise InputError(
-                    f"{circuit.label}: the rate of {name!r} in one cell depends on what other cells"
-                    " there are (a sum or a mean over them, or a draw?). A rate function may use"
-                    " only its own cell and the concentrations outside it."
-                )
+    for k, own in zip((0, count - 1), alone, strict=True):
+        for whole, one in zip(crowd, own, strict=True):
+            _check_alone(circuit.label, k, whole, one)
     for what, found in (("species", inside), ("signal", outside)):
         for name, value in found.items():
             if not bool(torch.isfinite(value.detach()).all()):
@@ -74,3 +70,18 @@ def try_circuit(
         }
         return tuple(n for n in circuit.part.signals if n in exchanged)
     return tuple(n for n in circuit.signals if n in outside)
+
+
+def _check_alone(
+    label: str, row: int, whole: Mapping[str, Tensor], one: Mapping[str, Tensor]
+) -> None:
+    """Raise InputError where the rates of a cell, by name, are others among all (M,) than alone
+    (1,)."""
+    for name, value in one.items():
+        among = whole[name].detach()[row : row + 1]
+        if not torch.allclose(among, value.detach(), rtol=1e-4, atol=1e-30, equal_nan=True):
+            raise InputError(
+                f"{label}: the rate of {name!r} in one cell depends on what other cells there are"
+                " (a sum or a mean over them, or a draw?). A rate function may use only its own"
+                " cell and the concentrations outside it."
+            )

@@ -131,9 +131,13 @@ class BoundCircuit(BoundEffect):
                 rows if rows.numel() else torch.zeros(1, dtype=torch.int64, device=state.device)
             ).repeat(2)[:64]
             tried = self._named(state, rows, kind, (), found, seen)
-            derivatives = circuit.method == "rosenbrock"
             each = [state.fields[n].index_select(0, rows) for n in self.fields]
-            exchanged[kind] = try_circuit(tried, torch.stack(each, 1), derivatives=derivatives)
+            exchanged[kind] = try_circuit(
+                tried,
+                torch.stack(each, 1),
+                self._unlike(state, rows, kind, found),
+                derivatives=circuit.method == "rosenbrock",
+            )
         self._check_constants(seen["p"])
         self.exchanged = exchanged
         of_networks = [n for made in self.networks.values() for n in made.signals]
@@ -154,6 +158,19 @@ class BoundCircuit(BoundEffect):
         for kind in self.rates:
             self.cells(state, cells_of_type(state, kind), kind, medium=medium)
         return state
+
+    def _unlike(
+        self, state: State, rows: Tensor, kind: Kind, found: Mapping[str, Tensor]
+    ) -> run.CircuitCells:
+        """These cells (M,) as if each were at a place of its own, of its own length and among
+        signals of its own."""
+        rows, number = rows.sort().values, torch.arange(len(rows), device=rows.device)
+        cells, more = state.take(rows), 1.0 + 0.1 * number.to(state.dtype)
+        cells = cells.replace(
+            position=cells.position + number.unsqueeze(1), length=cells.length * more
+        )
+        around = {n: x.index_select(0, rows) * more.to(x.dtype) for n, x in found.items()}
+        return self._named(cells, number, kind, (), around)
 
     def _compiled(self, kind: Kind, state: State, cells: run.CircuitCells) -> run.CircuitCells:
         """The cells with their circuit's equations, where there are: torch's derivatives, too."""
