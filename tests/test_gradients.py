@@ -406,3 +406,40 @@ def test_the_warning_of_a_loose_solve_comes_once_and_points_at_the_users_line(co
             grown().length.sum().backward()
         assert [(w.category, w.filename) for w in caught] == [(RuntimeWarning, __file__)]
         assert "solved to" in str(caught[0].message)
+
+
+def one_gene(u, s, p, cell):
+    return {"r": p.k / (1 + u.r**2) - u.r}
+
+
+@pytest.mark.parametrize(
+    "effects, words",
+    [
+        (lambda x: [tf.Growth(rate=x), tf.Mechanics(dim=2, tolerance=1e-8)], "contacts"),
+        (lambda x: [tf.Circuit(one_gene, species="r", k=x)], "the stiff method of circuits"),
+    ],
+)
+def test_second_derivatives_are_refused_where_they_would_be_wrong(effects, words):
+    x = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+    cells = tf.Cells([[0.0, 0.0], [3.1, 0.0]], [[1.0, 0.0]] * 2, 2.0)
+    scene = tf.Scene(*effects(x), founders=cells, dim=2)
+    end = tf.rollout(scene, scene.bind(dtype=torch.float64).start(), until=0.1)
+    loss = (
+        end.length.sum() + end.position.square().sum() + sum(v.sum() for v in end.fields.values())
+    )
+    with pytest.raises(RuntimeError, match=f"no second derivatives through {words}"):
+        torch.autograd.grad(loss, x, create_graph=True)
+
+
+def test_second_derivatives_through_equal_steps_are_right():
+    def slope(k, again=False):
+        k = torch.tensor(k, dtype=torch.float64, requires_grad=True)
+        scene = tf.Scene(tf.Circuit(one_gene, species="r", k=k, method="heun2"), dim=2)
+        end = tf.rollout(scene, scene.bind(dtype=torch.float64).start(), until=0.2)
+        return k, torch.autograd.grad(end.r.square().sum(), k, create_graph=again)[0]
+
+    k, first = slope(2.0, again=True)
+    second = torch.autograd.grad(first, k)[0]
+    differences = (slope(2.0 + 1e-4)[1] - slope(2.0 - 1e-4)[1]) / 2e-4
+    assert float(second) == pytest.approx(float(differences), rel=1e-6)
+    assert abs(float(second)) > 1e-3

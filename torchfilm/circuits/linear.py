@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchfilm.tools.tangents import tracked
+from torchfilm.tools.tangents import refuse_second, tracked
 
 # A pivot smaller than this share of its scale has lost half of its digits in a difference.
 LEAST_PIVOT = 1e-8
@@ -71,8 +71,8 @@ class _LinearSolve(torch.autograd.Function):
         return x
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx, grad: Tensor):
+        refuse_second("the stiff method of circuits")
         lu, x = ctx.saved_tensors
         y = substitute_transposed(lu, grad)
         return -y.unsqueeze(1) * x.unsqueeze(0), None, y

@@ -11,6 +11,7 @@ from torchfilm.physics.preconditioner import FreeDofPreconditioner
 from torchfilm.physics.problem import ContactProblem
 from torchfilm.tools.cg import CGResult, conjugate_gradients, worst_of
 from torchfilm.tools.checks import SimulationError
+from torchfilm.tools.tangents import refuse_second
 
 
 def attach_gradient(
@@ -82,4 +83,5 @@ class _AdjointFunction(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad: Tensor):
+        refuse_second("contacts")
         return -ctx.solve_again(grad.contiguous()), None

@@ -86,3 +86,13 @@ def scaled(value: Tensor, factor: Tensor) -> Tensor:
     plain, moved = both(value)
     assert moved is not None
     return with_tangent(plain * factor, moved * factor)
+
+
+def refuse_second(what: str) -> None:
+    """Raise RuntimeError in a backward pass that is to be differentiated again: its own graph is
+    not kept, so that second derivatives would be wrong."""
+    if torch.is_grad_enabled():
+        raise RuntimeError(
+            f"there are no second derivatives through {what}: leave out create_graph=True, or take"
+            " differences of gradients."
+        )
