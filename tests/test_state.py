@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
+import pickle
 
 import pytest
 import torch
@@ -320,3 +322,16 @@ def test_wrong_input_is_named(case):
     state = batch()
     with pytest.raises(tf.InputError, match=message):
         call(state)
+
+
+@pytest.mark.parametrize("name", ["quorum_sensing", "toggle_switch", "nutrient_limited", "channel"])
+@pytest.mark.parametrize("copied", [lambda s: pickle.loads(pickle.dumps(s)), copy.deepcopy])
+def test_a_state_may_be_sent_or_copied_and_goes_on_as_the_first_does(name, copied):
+    scene = getattr(tf.scenes, name)()
+    *_, state = tf.simulate(scene, colonies=2, until=0.5)
+    ends = []
+    for start in (state, copied(state)):
+        *_, end = tf.simulate(scene.bind(state=start), start, until=0.7)
+        ends.append(end)
+    assert all(torch.equal(ends[0].fields[n], ends[1].fields[n]) for n in state.fields)
+    assert torch.equal(ends[0].position, ends[1].position)

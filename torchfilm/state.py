@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -16,10 +15,10 @@ from torchfilm.physics import capsule
 from torchfilm.signals.layout import Contact, Layout, Signals
 from torchfilm.tools import checks, displays, random, row_checks
 from torchfilm.tools.ragged import Groups, offsets
+from torchfilm.tools.read_only import read_only
 
 CELL, COLONY, GRID = "cell", "colony", "grid"
-# why cells leave a state
-FATES = ("divided", "removed", "left", "failed")
+FATES = ("divided", "removed", "left", "failed")  # why cells leave a state
 # Signals stand among the fields under "out.NAME", beside what cells hold under the same name.
 OUTSIDE = "out."
 
@@ -134,7 +133,7 @@ class State:
 
     def __post_init__(self) -> None:
         for name in MAPPINGS:
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+            object.__setattr__(self, name, read_only(getattr(self, name)))
 
     def __getattr__(self, name: str) -> Tensor:
         fields = self.__dict__.get("fields", {})
@@ -244,7 +243,7 @@ class State:
             if name in parts and not changes.keys().isdisjoint(of):
                 del parts[name]
         for name, value in changes.items():
-            parts[name] = MappingProxyType(dict(value)) if name in MAPPINGS else value
+            parts[name] = read_only(value) if name in MAPPINGS else value
         made.__dict__.update(parts)
         return made
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -77,38 +78,11 @@ class Transport:
 
     def first(self, name: str) -> Callable[[State, Tensor], Tensor]:
         """The first values of a signal, as a field's `initial`."""
-        return lambda state, rows: self.values(name, "initial", state).index_select(0, rows)
+        return partial(_first_values, self.signals[name], name)
 
     def values(self, name: str, what: str, state: State) -> Tensor:
         """The initial, source or decay of a signal on every voxel, (nodes,); 0 in obstacles."""
-        given: OnGrid = getattr(self.signals[name], what)
-        layout = state.layout
-        assert layout is not None
-        if callable(given):
-            found = given(layout.grid.centres())
-            label = f"{what}(positions) of the signal {name!r}"
-            if not isinstance(found, Tensor) or found.shape != (layout.grid.nodes,):
-                shown = tuple(found.shape) if isinstance(found, Tensor) else found
-                raise checks.input_error(
-                    label,
-                    shown,
-                    f"a tensor of shape ({layout.grid.nodes},), one number for each position",
-                )
-            bad = torch.nonzero(~((found >= 0) & (found < torch.inf))).squeeze(1)
-            if bad.numel():
-                where = [round(x, 3) for x in layout.grid.centres()[bad[0]].tolist()]
-                raise checks.input_error(
-                    label,
-                    float(found[bad[0]]),
-                    "finite and at least 0 everywhere",
-                    f"It is not at {where} µm and {bad.numel() - 1} more positions.",
-                )
-            value = found.to(dtype=state.dtype, device=state.device)
-        else:
-            value = (
-                _of_colonies(given, state).expand(state.colonies).index_select(0, layout.grid.owner)
-            )
-        return value if layout.mask is None else value * layout.mask
+        return _on_grid(self.signals[name], name, what, state)
 
     def carried(self, state: State, dt: float) -> State:
         """The state after transport of the signals for dt hours; cells do not change."""
@@ -224,6 +198,40 @@ def _closure_tensors(signal: Signal, flow: Flow) -> list[Tensor]:
         cell.cell_contents for f in functions for cell in getattr(f, "__closure__", None) or ()
     ]
     return [x for x in cells if isinstance(x, Tensor)]
+
+
+def _first_values(signal: Signal, name: str, state: State, rows: Tensor) -> Tensor:
+    return _on_grid(signal, name, "initial", state).index_select(0, rows)
+
+
+def _on_grid(signal: Signal, name: str, what: str, state: State) -> Tensor:
+    """The initial, source or decay of a signal on every voxel, (nodes,); 0 in obstacles."""
+    given: OnGrid = getattr(signal, what)
+    layout = state.layout
+    assert layout is not None
+    if callable(given):
+        found = given(layout.grid.centres())
+        label = f"{what}(positions) of the signal {name!r}"
+        if not isinstance(found, Tensor) or found.shape != (layout.grid.nodes,):
+            shown = tuple(found.shape) if isinstance(found, Tensor) else found
+            raise checks.input_error(
+                label,
+                shown,
+                f"a tensor of shape ({layout.grid.nodes},), one number for each position",
+            )
+        bad = torch.nonzero(~((found >= 0) & (found < torch.inf))).squeeze(1)
+        if bad.numel():
+            where = [round(x, 3) for x in layout.grid.centres()[bad[0]].tolist()]
+            raise checks.input_error(
+                label,
+                float(found[bad[0]]),
+                "finite and at least 0 everywhere",
+                f"It is not at {where} µm and {bad.numel() - 1} more positions.",
+            )
+        value = found.to(dtype=state.dtype, device=state.device)
+    else:
+        value = _of_colonies(given, state).expand(state.colonies).index_select(0, layout.grid.owner)
+    return value if layout.mask is None else value * layout.mask
 
 
 def _of_colonies(given: float | Tensor, state: State) -> Tensor:

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 import warnings
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -85,6 +86,10 @@ class Groups:
     def __init__(self, owner: Tensor, size: int, ordered: bool = False):
         self.owner, self.size, self.ordered = owner, size, ordered
         self._matrix: dict[torch.dtype, Tensor] = {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # without what it has worked out: torch does not copy sparse matrices
+        return (Groups, (self.owner, self.size, self.ordered))
 
     @cached_property
     def counts(self) -> Tensor:
