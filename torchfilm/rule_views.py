@@ -36,6 +36,8 @@ MEANS = {
     "colony": ("cells",),
 }
 IDENTITY = ("uid", "parent", "colony")
+# fields that only an effect acts on
+OF_EFFECTS = {"growth_rate": "tf.Growth()", "divide_flag": "tf.Division()"}
 KNOWN_FIELDS = {
     "cell_type": CELL_TYPE,
     "drag": Field("drag", "factor on the viscosity that this cell feels", initial=1.0),
@@ -205,6 +207,8 @@ class CellsView:
             )
             dtype = state.dtype if plain else tensor.dtype
         if self._declaring and name not in (*state.fields, *KNOWN_FIELDS, "remove_flag"):
+            if name in OF_EFFECTS:
+                raise RuleError(f"cells.{name} acts only with {OF_EFFECTS[name]} in the scene.")
             near = difflib.get_close_matches(
                 name, [*state.fields, *KNOWN_FIELDS, "remove_flag", *PAPER_NAMES], 1, cutoff=0.85
             )

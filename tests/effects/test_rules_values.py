@@ -4,7 +4,12 @@ others go on as if they were alone."""
 from __future__ import annotations
 
 import math
+import random
+import re
+import warnings
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from helpers import step
@@ -179,3 +184,75 @@ def test_a_type_in_which_no_circuit_runs_is_no_fault(circuit):
     )
     state = run(scene, scene.bind().start(), 2)
     assert state.cell_type.tolist() == [7, 7] and not failures(state)
+
+
+def growing(*effects, **options) -> tf.Scene:
+    return tf.Scene(*effects, tf.Mechanics(dim=2), founders=tf.Cells.single(2), **options)
+
+
+@pytest.mark.parametrize(
+    "name, effect, others",
+    [
+        ("growth_rate", "tf.Growth()", [tf.Division(length=4.0)]),
+        ("divide_flag", "tf.Division()", [tf.Growth(rate=1.0)]),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_a_field_that_only_an_effect_acts_on_is_no_variable(name, effect, others):
+    rule = lambda cells: setattr(cells, name, 1.0)
+    with pytest.raises(tf.InputError, match=rf"cells\.{name} acts only with {re.escape(effect)}"):
+        growing(*others, tf.Rules(rule)).bind()
+    with pytest.raises(tf.InputError, match=rf"Rules\.variables: {name}.*{re.escape(effect)}"):
+        tf.Rules(rule, variables={name: 0.0})
+
+
+def make(u, s, p, cell):
+    return {"gfp": 1.0 - u.gfp}
+
+
+def test_a_negative_concentration_from_a_rule_is_named():
+    def spoil(cells):
+        cells.gfp = torch.where(cells.length > 2.5, -1.0, cells.gfp)
+
+    scene = growing(tf.Growth(rate=1.0), tf.Rules(spoil), tf.Circuit(make, species="gfp"))
+    with pytest.raises(tf.SimulationError, match=r"cells\.gfp of cell 0 was set to -1.*at least 0"):
+        *_, _ = tf.simulate(scene, until=1.0)
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda n: torch.rand(n),
+        lambda n: float(np.random.rand()),  # noqa: NPY002
+        lambda n: random.random(),
+    ],
+)
+def test_random_numbers_that_no_seed_sets_are_warned_of(draw):
+    def wild(cells):
+        cells.growth_rate = draw(len(cells.length))
+
+    def keyed(cells):
+        cells.growth_rate = cells.random()
+
+    with pytest.warns(UserWarning, match=r"draws random numbers.*Use cells\.random\(\)"):
+        growing(tf.Growth(), tf.Rules(wild)).bind()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        growing(tf.Growth(), tf.Rules(keyed)).bind()
+
+
+def test_an_error_in_a_rule_has_its_line():
+    def pulse(cells):
+        cells.growth_rate = torch.where(cells.time > 1, 0.0, 1.0)
+
+    def wrong(cells):
+        cells.growth_rate = torch.exp("much")
+
+    here = rf"{re.escape(Path(__file__).name)}, line \d+ \(cells\.growth_rate = torch"
+    for rule, words in (
+        (pulse, here + r"\.where.*\): torch\.where wants a column.*if cells\.time > 1 else"),
+        (wrong, here + r"\.exp.*\): TypeError: "),
+        (lambda: None, r"rule .*<lambda>: TypeError: .*takes 0 positional arguments"),
+    ):
+        with pytest.raises(tf.InputError, match=words):
+            growing(tf.Growth(), tf.Rules(rule)).bind()

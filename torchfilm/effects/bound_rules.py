@@ -6,13 +6,16 @@ be right in any colony, such as a wrong shape or an unknown name, is an error of
 
 from __future__ import annotations
 
+import random
 import traceback
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,10 +24,27 @@ from torchfilm.rule_views import KNOWN_FIELDS, MEANS, CellsView, DivisionView, R
 from torchfilm.state import Births, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import HotReload
+from torchfilm.tools.warn_once import warn
+from torchfilm.values import CONCENTRATION
 
 if TYPE_CHECKING:
     from torchfilm.effects.rules import Rules
 
+ONE_NUMBER = (
+    "a rule sees all cells at once, so `if` or `float` has no single value to use. Write"
+    " torch.where(condition, a, b) with &, | and ~, or go through them one by one (slow): for cell"
+    " in cells."
+)
+# what to do, by a part of torch's words
+HINTS = {
+    "Boolean value of Tensor": ONE_NUMBER,
+    "converted to Scalar": ONE_NUMBER,
+    "only one element tensors": ONE_NUMBER,
+    "where() received": (
+        "torch.where wants a column of cells as its condition. cells.time and cells.dt are"
+        " plain numbers: write `a if cells.time > 1 else b`."
+    ),
+}
 TRIAL_STEP = 0.025  # h, the step that a rule sees in its trial
 MEANING = "variable of the user's rules"
 
@@ -88,7 +108,9 @@ class _BoundRule(BoundEffect):
     def _with_report(self, state: State, rows: Tensor | None, given: Mapping[str, Tensor]) -> State:
         """The state with a report of those values that no effect can use, given to the cells `rows`
         (M,), or to all cells; the state itself where there is no such value."""
-        each = {n: self._unusable(n, value.detach()) for n, value in given.items()}
+        each = {
+            n: self._unusable(n, value.detach(), state.declared[n]) for n, value in given.items()
+        }
         marks = {n: found for n, found in each.items() if found is not None}
         if not marks or not bool(torch.stack(list(marks.values())).any()):
             return state
@@ -117,10 +139,10 @@ class _BoundRule(BoundEffect):
         status[list(words)] = 1
         return state.replace(reports={**state.reports, self.title: RulesReport(status, words)})
 
-    def _unusable(self, name: str, value: Tensor) -> Tensor | None:
+    def _unusable(self, name: str, value: Tensor, declared: Field) -> Tensor | None:
         """Which of these values (M, …) no effect can use, (M,) bool; None: all may be used."""
-        if name == "growth_rate":
-            return ~(value >= 0)
+        if name == "growth_rate" or declared.unit == CONCENTRATION:
+            return _of_rows(~(value >= 0))
         if name == "drag":
             return ~(value > 0)
         if name == "cell_type" and self.types:
@@ -142,7 +164,7 @@ class _BoundRule(BoundEffect):
         allowed = {
             "growth_rate": "at least 0. To let cells vanish, set remove_flag",
             "drag": "above 0",
-        }.get(name, "a number")
+        }.get(name, "at least 0" if bool((value < 0).any()) else "a number")
         shown = f"{float(value):g}" if value.dim() == 0 else value.tolist()
         return f"was set to {shown}: it must be {allowed}"
 
@@ -197,7 +219,8 @@ class BoundRules(_BoundRule):
         tried = state.take(both) if twice else state
         view = CellsView(tried, TRIAL_STEP, _label(update), declaring=True)
         try:
-            _act(update, view)
+            with _own_draws(_label(update)):
+                _act(update, view)
         except RuleError as error:
             if not twice or "shape" not in str(error):
                 raise
@@ -339,32 +362,38 @@ def _label(rule: Callable[..., None]) -> str:
     )
 
 
+@contextmanager
+def _own_draws(label: str) -> Iterator[None]:
+    """Warn of a rule that draws from generators which no seed of a run sets."""
+    states = lambda: (torch.get_rng_state().tolist(), str(np.random.get_state()), random.getstate())  # noqa: NPY002
+    before = states()
+    yield
+    if states() != before:
+        warn(
+            f"{label} draws random numbers with torch, numpy or random: another run with the same"
+            " seed has other numbers. Use cells.random(), which has a number for each cell, keyed"
+            " by seed, colony, cell and step."
+        )
+
+
 def _act(rule: Callable[..., None], *views: CellsView | DivisionView) -> None:
-    """Calls a rule on its views. Raises RuleError if it uses a tensor as one number."""
+    """Calls a rule on its views. Raises RuleError, with the line, if it uses a tensor as one
+    number, or calls a function with what that does not take."""
     try:
         rule(*views)
-    except (RuntimeError, ValueError) as error:
-        if not any(
-            words in str(error)
-            for words in (
-                "Boolean value of Tensor",
-                "converted to Scalar",
-                "only one element tensors",
-            )
-        ):
+    except (RuntimeError, ValueError, TypeError) as error:
+        if isinstance(error, checks.InputError):
             raise
+        hint = next((words for part, words in HINTS.items() if part in str(error)), "")
         # the innermost frame outside torch is a line of the rule
         at = next(
             f
             for f in reversed(traceback.extract_tb(error.__traceback__))
             if "torch" not in Path(f.filename).parts
         )
-        raise RuleError(
-            f"{Path(at.filename).name}, line {at.lineno} ({at.line}): a rule sees all cells at"
-            " once, so `if` or `float` has no single value to use. Write"
-            " torch.where(condition, a, b) with &, | and ~, or go through them one by one (slow):"
-            " for cell in cells."
-        ) from error
+        said = hint or f"{type(error).__name__}: {str(error).splitlines()[0]}"
+        place = f"{Path(at.filename).name}, line {at.lineno} ({at.line})"
+        raise RuleError(f"{_label(rule) if at.filename == __file__ else place}: {said}") from error
     for view in views:
         view.check_unharmed()
 

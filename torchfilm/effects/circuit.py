@@ -43,7 +43,7 @@ from torchfilm.resolver import Values
 from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.backends import check_backend
-from torchfilm.values import COLONY, Rule, Value, checked
+from torchfilm.values import COLONY, CONCENTRATION, Rule, Value, checked
 
 Part = run.RateFunction | Sequence[Reaction | Sequence[Reaction]]
 
@@ -322,7 +322,7 @@ class Circuit(Effect):
             Field(
                 self.variables[n],
                 "concentration in the cell",
-                "conc",
+                CONCENTRATION,
                 initial=_First(self, n),
                 at_division="reset" if self.variables[n] in again else "copy",
             )

@@ -28,7 +28,7 @@ from torchfilm.signals.transport_series import MOST
 from torchfilm.state import COLONY, GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import check_backend, why_torch
-from torchfilm.values import PerColony, Rule, checked
+from torchfilm.values import CONCENTRATION, PerColony, Rule, checked
 
 # A value on the grid: a number, one per colony, or a function from positions (M, 3) µm to (M,).
 OnGrid = float | Tensor | Callable[[Tensor], Tensor]
@@ -223,7 +223,8 @@ class Medium(Effect):
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         fields = [
-            Field(OUTSIDE + n, "signal in the medium", "conc", scope=GRID) for n in self.signals
+            Field(OUTSIDE + n, "signal in the medium", CONCENTRATION, scope=GRID)
+            for n in self.signals
         ]
         if self.outside == "reservoir":
             # float64: after thousands of steps, a float32 sum would round away what a step adds

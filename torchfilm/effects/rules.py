@@ -20,7 +20,7 @@ from typing import Any
 
 from torchfilm.effect import RULES, Binding, BoundEffect, Effect
 from torchfilm.effects.bound_rules import MEANING, BoundRules, DivisionRule
-from torchfilm.rule_views import CellsView, DivisionView
+from torchfilm.rule_views import OF_EFFECTS, CellsView, DivisionView
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import HotReload, edited, load_functions
@@ -71,6 +71,12 @@ class Rules(Effect):
                 " tf.Rules(update)."
             )
         for name, value in self.variables.items():
+            if name in OF_EFFECTS:
+                raise checks.input_error(
+                    f"Rules.variables: {name}",
+                    value,
+                    f"left to {OF_EFFECTS[name]}, which has it: list that beside Rules",
+                )
             checks.number(f"Rules.variables[{name!r}]", value)
         object.__setattr__(self, "path", path)
         object.__setattr__(self, "functions", functions)
