@@ -335,3 +335,25 @@ def test_a_state_may_be_sent_or_copied_and_goes_on_as_the_first_does(name, copie
         ends.append(end)
     assert all(torch.equal(ends[0].fields[n], ends[1].fields[n]) for n in state.fields)
     assert torch.equal(ends[0].position, ends[1].position)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda s: {"colony": s.colony.flip(0)}, r"state\.colony\[\d\].*side by side"),
+        (lambda s: {"length": -s.length}, r"state\.length\[0\] = -2.*at least 0 µm"),
+        (lambda s: {"length": s.length * torch.nan}, r"state\.length\[0\] = nan.*at least 0"),
+        (lambda s: {"radius": 0 * s.radius}, r"state\.radius\[0\] = 0.*above 0 µm"),
+        (lambda s: {"axis": s.axis.double()}, r"state\.axis = .*float64.*torch\.float32"),
+        (lambda s: {"uid": s.uid[:2]}, r"state\.uid = .\(2,\).*shape \(6,\)"),
+        (lambda s: {"position": s.position[:, :1]}, r"position = \(6, 1\)|-D"),
+    ],
+)
+def test_a_state_that_was_edited_is_checked_before_it_is_run(change, words):
+    state = batch()
+    model = tf.Scene(tf.Growth(rate=1.0), dim=2).bind(state=state)
+    with pytest.raises(tf.InputError, match=words):
+        tf.simulate(model, state.replace(**change(state)), until=0.1)
+    with pytest.raises(tf.InputError, match="one value for each cell"):
+        short = state.with_fields(growth_rate=state.growth_rate[:2])
+        tf.simulate(model, short, until=0.1)

@@ -330,7 +330,10 @@ class BoundEffect:
 
     def step(self, state: State, dt: float) -> State:
         """The state after this effect has acted for dt hours."""
-        return self.effect.step(state, dt, self.values)
+        made = self.effect.step(state, dt, self.values)
+        if made is None:
+            raise TypeError(f"{type(self.effect).__name__}.step must return the state; it gave None")
+        return made
 
     def run_step(self, state: State, dt: float) -> State:
         """As `step`; torch has one thread where kernels compute, and else those it was given."""

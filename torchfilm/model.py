@@ -26,9 +26,10 @@ from torchfilm.initial_cells import Cells
 from torchfilm.joined_step import JoinedStep, joined
 from torchfilm.parameters import parameters
 from torchfilm.resolver import BoundBatch
-from torchfilm.state import CELL, Field, State
+from torchfilm.state import CELL, PER_CELL, Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.hashing import digest
+from torchfilm.tools.row_checks import check_geometry
 from torchfilm.tools.tangents import tracked
 from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.timing import Timings
@@ -178,6 +179,9 @@ class Model:
                 f"{self.batch.dtype} on {self.batch.device}, as the model is",
                 "Bind the scene to the state: scene.bind(state=state).",
             )
+        columns = {name: getattr(state, name) for name in PER_CELL}
+        check_geometry(columns, state.colonies, state.dim, state.dtype)
+        state.check_fields()
         highest = int(state.colony_id.max())
         if highest >= self.batch.colonies and self.scene.per_colony():
             path, tensor = self.scene.per_colony()[0]

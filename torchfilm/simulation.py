@@ -205,6 +205,8 @@ def rollout(
     """The state at `until` (h), for gradients through a long run: only every `segment`-th state is
     kept, and the steps between are computed again on the way back (torch.utils.checkpoint), so that
     memory grows with the number of segments and not of steps; None keeps all, and saves the time.
+    So nothing that the scene reads may change before the gradient is taken: call `backward` before
+    the step of an optimiser.
     scene: or a model, or a `Replay`, whose steps are as long as its recording's. state: from which
     to start; by default the first. Failures are raised as in `simulate`.
     """

@@ -68,6 +68,32 @@ def check_declaration(name: Any, shape: Any, initial: Any) -> None:
         raise checks.input_error(f"Field({name!r}).initial", initial, rule)
 
 
+def check_geometry(columns: Mapping[str, Tensor], colonies: int, dim: int, dtype: Any) -> None:
+    """Raises InputError where columns of cells, by name, have not a row for each cell or another
+    dtype, colonies do not stand side by side, or a cell has an impossible size."""
+    count = columns["colony"].numel()
+    shapes = {"position": (count, dim), "axis": (count, dim)}
+    dtypes = dict.fromkeys(("axis", "length", "radius"), dtype) | {"position": torch.float64}
+    for name, value in columns.items():
+        wanted, kind = shapes.get(name, (count,)), dtypes.get(name, torch.int64)
+        if value.shape != wanted or value.dtype != kind:
+            given = f"{tuple(value.shape)}, {value.dtype}"
+            raise checks.input_error(f"state.{name}", given, f"of shape {wanted} and {kind}")
+    colony = columns["colony"]
+    bad = {
+        "colony": (
+            (colony < 0) | (colony >= colonies) | (colony.diff(prepend=colony[:1]) < 0),
+            f"a place from 0 to {colonies - 1}, with the cells of a colony side by side",
+        ),
+        "length": (~(columns["length"] >= 0), "at least 0 µm"),
+        "radius": (~(columns["radius"] > 0), "above 0 µm"),
+    }
+    for name, (wrong, rule) in bad.items():
+        if bool(wrong.any()):
+            k = int(torch.nonzero(wrong)[0])
+            raise checks.input_error(f"state.{name}[{k}]", columns[name][k].item(), rule)
+
+
 def check_tensors(values: Mapping[str, Any]) -> None:
     """Raises InputError for a field's new values that are no tensor."""
     for name, value in values.items():
