@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SHOWN = 3  # replicates side by side
+# losses of which the largest is so many times the smallest are drawn by their logarithms
+WIDE = 100.0
 
 
 def draw(report: SearchReport) -> Figure:
@@ -150,19 +152,21 @@ def _draw_row(
 
 
 def _draw_convergence(ax: Axes, report: SearchReport) -> None:
-    """The loss of the first guess, of every full-size design, and the lowest so far; and of the
-    best trivial answer."""
+    """The loss of the first guess, of every full-size design that did not fail, and the lowest so
+    far; and of the best trivial answer."""
     study = report.study
     spent = np.concatenate([[0.0], study.convergence()[0]])
     places, losses = [np.empty(0)], [np.empty(0)]
     for entry, begin, end in zip(study.entries, spent[:-1], spent[1:], strict=True):
         if study.is_full(entry):
             places.append(np.linspace(begin, end, len(entry.loss) + 1)[1:])
-            losses.append(entry.loss)
+            failed = np.isin(np.arange(len(entry.loss)), [row for row, _ in entry.reasons])
+            losses.append(np.where(failed, np.nan, entry.loss))
     x, y = np.concatenate(places), np.concatenate(losses)
     ax.plot(x, y, ".", color="0.75", ms=2, zorder=0)
-    ax.step(x, np.minimum.accumulate(y), where="post", color="C3")
-    ax.plot([0.0], [report.first.loss], "o", color="0.55", clip_on=False)  # as among parameters
+    ax.step(x, np.fmin.accumulate(y), where="post", color="C3")
+    if report.first.colonies:
+        ax.plot([0.0], [report.first.loss], "o", color="0.55", clip_on=False)  # as among parameters
     answers = trivial_answers(report)
     if answers:
         name = best_trivial(report.task.target, answers)
@@ -172,7 +176,11 @@ def _draw_convergence(ax: Axes, report: SearchReport) -> None:
             xytext=(-2, -2), textcoords="offset points", ha="right", va="top", fontsize=7,
             color="0.3",
         )  # fmt: skip
-    ax.set(xlabel="colonies simulated", ylabel="loss", ylim=(0, None))
+    some = y[np.isfinite(y)]
+    wide = len(some) > 0 and some.min() > 0 and some.max() > WIDE * some.min()
+    if wide:
+        ax.set_yscale("log")
+    ax.set(xlabel="colonies simulated", ylabel="loss", **({} if wide else {"ylim": (0, None)}))
     ax.set_title("designs at full size (grey), the best so far (red)", fontsize=9)
 
 

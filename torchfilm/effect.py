@@ -332,7 +332,8 @@ class BoundEffect:
         """The state after this effect has acted for dt hours."""
         made = self.effect.step(state, dt, self.values)
         if made is None:
-            raise TypeError(f"{type(self.effect).__name__}.step must return the state; it gave None")
+            name = type(self.effect).__name__
+            raise TypeError(f"{name}.step must return the state; it returned None")
         return made
 
     def run_step(self, state: State, dt: float) -> State:

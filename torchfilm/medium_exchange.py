@@ -4,6 +4,7 @@ One service that circuits and nutrition share."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -13,9 +14,35 @@ from torch import Tensor
 from torchfilm.signals.exchange import ULPS, write
 from torchfilm.signals.stencil import Stencil
 from torchfilm.state import OUTSIDE, State
+from torchfilm.tools.ragged import Groups
 from torchfilm.tools.threads import Course, Loop
 
 _found_outside = Course()
+
+
+@dataclass(frozen=True, eq=False)
+class Exchanged:
+    """What the cells of a state exchanged in a step. found: the concentration of each signal at
+    each cell as the step began, (N,) by name. given: what each gave to its pool, conc·µm³,
+    (negative: took). pool: (N,) µm³. groups: of the cells by colony."""
+
+    found: Mapping[str, Tensor]
+    given: Mapping[str, Tensor]
+    pool: Tensor
+    groups: Groups
+
+    @property
+    def swing(self) -> Tensor:
+        """How far exchange moved the pools in the step, (B,): |change| over what they held half
+        way, a mean over the cells that exchange; of the signal where it is most."""
+        most = torch.zeros(self.groups.size, dtype=torch.float64, device=self.pool.device)
+        for name, amount in self.given.items():
+            change = amount.double() / self.pool.double()
+            half_way = self.found[name].double() + 0.5 * change
+            share = torch.where(change != 0, change.abs() / half_way.abs().clamp(min=1e-300), 0.0)
+            sums = self.groups.sum(torch.stack([share, (change != 0).double()], 1))
+            most = torch.maximum(most, sums[:, 0] / sums[:, 1].clamp(min=1.0))
+        return most
 
 
 class MediumExchange:
@@ -52,6 +79,7 @@ class MediumExchange:
         self._given: dict[str, Tensor] = {}
         self._to_reservoir: dict[str, Tensor] = {}
         self._written: dict[str, Tensor] = {}
+        self._in_loops: dict[str, Tensor] = {}  # what is given by loops that write it, too
 
     @staticmethod
     def of(state: State, signals: Sequence[str]) -> MediumExchange | None:
@@ -95,9 +123,16 @@ class MediumExchange:
         loops, meeting = [], self._meeting
         assert meeting is not None
         for name, amount in given.items():
+            self._in_loops[name] = torch.from_numpy(amount)
             self._written[OUTSIDE + name], loop = meeting.written(name, amount, ULPS)
             loops.append(loop)
         return loops
+
+    def exchanged(self) -> Exchanged:
+        """What has been given in this step, without its gradient."""
+        given = {n: x.detach() for n, x in (self._given | self._in_loops).items()}
+        found = {n: self.found[n].detach() for n in given}
+        return Exchanged(found, given, self.pool.detach(), self.state.groups)
 
     def settle(self, **more: Tensor) -> State:
         """The state in which the medium has what was given to it. more: other fields to

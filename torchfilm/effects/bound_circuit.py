@@ -298,8 +298,9 @@ class BoundCircuit(BoundEffect):
             cells = [self.cells(middle, rows[k], k, medium=medium, same=same) for k in left]
             changed = self._by_torch(state, start, cells, medium, report, changed)
         changed[self.effect.volume_field] = start.half.end
+        exchanged = None if medium is None else medium.exchanged()
         state = state.with_fields(**changed) if medium is None else medium.settle(**changed)
-        return state.replace(reports={**state.reports, self.title: report.report()})
+        return state.replace(reports={**state.reports, self.title: report.report(exchanged)})
 
     def begun(self, state: State) -> tuple[State, Start]:
         """The cells as they are half way through their growth, and what a step begins with."""

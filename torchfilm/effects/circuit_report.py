@@ -4,23 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from torchfilm.circuits import run
 from torchfilm.circuits.dilution import Start
+from torchfilm.effect import Concern
+from torchfilm.medium_exchange import Exchanged
 from torchfilm.state import State
+
+# Of the pools' swing: from which it is a concern, after how many steps, in colonies of how many
+# cells; and what is fine.
+SWING, LASTING, CROWD, FINE = 0.5, 40, 100, 0.1
 
 
 @dataclass(frozen=True)
 class CircuitReport:
     """`status` (B,): 0, or 1 where a cell's circuit could not be stepped, and `words`, by place in
-    the batch, what happened there. steps, (N,) int64: how many steps each cell's circuit took."""
+    the batch, what happened there. steps, (N,) int64: how many steps each cell's circuit took.
+    exchanged: what cells gave to the medium; None without one."""
 
     status: Tensor
     steps: Tensor
     words: Mapping[int, str]
+    exchanged: Exchanged | None = None
     hint = (
         "Look at the signs of the rates (none may be below 0 where its species is 0), at their"
         " units (per hour), and at whether they stay finite; a smaller dt may help"
@@ -28,6 +37,31 @@ class CircuitReport:
 
     def reason(self, place: int) -> str:
         return self.words[place]
+
+    @property
+    def swing(self) -> Tensor:
+        """`Exchanged.swing`, (B,); 0 without a medium."""
+        none = torch.zeros(len(self.status), dtype=torch.float64, device=self.status.device)
+        return none if self.exchanged is None else self.exchanged.swing
+
+    def concerns(self) -> list[Concern]:
+        """Colonies in which exchange and transport lag behind each other for long. Small ones are
+        left out: around a few cells a signal is weak, and its swing says little."""
+        if self.exchanged is None or not self.exchanged.given:
+            return []
+        swing = self.swing
+        where = (swing > SWING) & (self.exchanged.groups.counts >= CROWD)
+        return [Concern("swing", where, LASTING, partial(_of_swing, swing))]
+
+
+def _of_swing(swing: Tensor, ids: Tensor, where: Tensor) -> str:
+    worst = float(swing[where].max())
+    return (
+        f"colony {', '.join(map(str, ids[where].tolist()[:5]))}: in one step, exchange moves the"
+        f" medium at the cells by {worst:.0%} in the mean, which transport and the other cells see"
+        " only afterwards; concentrations there may be off by as much. With a dt"
+        f" {worst / FINE:.0f} times smaller it is a tenth."
+    )
 
 
 class Failures:
@@ -71,6 +105,6 @@ class Failures:
             return torch.zeros_like(self.state.colony)
         return self.steps
 
-    def report(self) -> CircuitReport:
+    def report(self, exchanged: Exchanged | None) -> CircuitReport:
         words = {place: text for place, (_, text) in self.words.items()}
-        return CircuitReport(self.status, self._steps(), words)
+        return CircuitReport(self.status, self._steps(), words, exchanged)
