@@ -8,13 +8,16 @@ from pathlib import Path
 from typing import Any
 
 DIGESTS = ("founders and functions", "code of the target", "code of resolve")
+# These differ with the parameters: the effects listed are those in the middle of the bounds.
+OF_PARAMETERS = ("names", "effects", "founders and functions")
 LONGEST, SHORT = 300, 48  # characters of a refusal, and of one value in it
 
 
 def refusal(path: Path, names: list[str], there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
     """The message for the study of another search: what differs, then as many values as fit."""
-    # the listed effects are those in the middle of the bounds, so bounds change them too
     names = sorted(names, key=lambda name: (name in DIGESTS, name == "effects"))
+    if "parameters" in names:
+        names = [name for name in names if name not in OF_PARAMETERS]
     out = f"{path.name} is the study of another search. Different: {', '.join(names)}."
     close = " Give another path (start= takes what this study knows), or restore the search."
     for name in names:
@@ -39,6 +42,8 @@ def _differing(old: Any, new: Any) -> tuple[str, str]:
         one, other = [x for x in old if x not in new], [x for x in new if x not in old]
         if len(one) == len(other) == 1:
             return _differing(one[0], other[0])
+        if not one and not other:  # in another order
+            one, other = old, new
         return ", ".join(map(str, one)) or "none", ", ".join(map(str, other)) or "none"
     before, after = str(old), str(new)
     shortest = min(len(before), len(after))

@@ -270,7 +270,11 @@ OTHERS = {
     "step": ({"dt": 0.05}, ["dt: 0.1 there, 0.05 here"]),
     "names": (
         {"parameters": [LIT[0]], "fixed": {"decay": 1.0}},
-        ["names: decay there, none here", "fixed: none there, decay=1.0 here"],
+        ["parameters: decay: 0.5 to 2.0 there, none here", "fixed: none there, decay=1.0 here"],
+    ),
+    "order": (
+        {"parameters": LIT[::-1]},
+        ["Different: parameters. parameters: make: 0.1 to 10.0 log, decay: 0.5 to 2.0 there"],
     ),
 }
 

@@ -138,3 +138,20 @@ def test_bad_fluorescence_is_refused(kind):
     images, options, message = BAD[kind]
     with pytest.raises(tf.InputError, match=message):
         tf.Cells.from_masks(masked(), pixel_size=0.1, fluorescence=images, **options)
+
+
+@pytest.mark.parametrize(
+    "axes, shape, words",
+    [
+        ("CYX", (2, *SHAPE), r"2 channels \(axes CYX\).*along axis 0"),
+        ("TCYX", (3, 2, *SHAPE), r"2 channels \(axes TCYX\).*along axis 1"),
+        ("ZYX", (4, *SHAPE), r"4 planes \(axes ZYX\)"),
+    ],
+)
+def test_channels_and_planes_are_not_taken_for_frames(axes, shape, words, tmp_path):
+    """A frame that is asked for is one in time."""
+    path, masks = tmp_path / "two.ome.tif", np.stack([masked()] * 3)
+    values = np.random.default_rng(0).random(shape).astype(np.float32)
+    tifffile.imwrite(path, values, photometric="minisblack", metadata={"axes": axes})
+    with pytest.raises(tf.InputError, match=words):
+        tf.Cells.from_masks(masks, pixel_size=0.1, frame=1, fluorescence={"gfp": path})

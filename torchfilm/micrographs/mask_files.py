@@ -113,6 +113,10 @@ def _file(path: Path, frame: int | None, what: str) -> np.ndarray:
         ) from error
 
 
+# axes of a TIFF file that are not frames in time
+STACKS = {"C": "channels", "Z": "planes"}
+
+
 def _read(path: Path, kind: str) -> np.ndarray:
     if kind == ".npy":
         return np.load(path, allow_pickle=False)
@@ -122,7 +126,17 @@ def _read(path: Path, kind: str) -> np.ndarray:
     except ImportError as error:
         raise checks.InputError(EXTRA) from error
     if kind in (".tif", ".tiff"):
-        return tifffile.imread(path)
+        with tifffile.TiffFile(path) as file:
+            first = file.series[0]
+            for axis, what in STACKS.items():
+                sizes = dict(zip(first.axes, first.shape, strict=True))
+                if sizes.get(axis, 1) > 1:
+                    raise checks.InputError(
+                        f"{path} is a stack of {sizes[axis]} {what} (axes {first.axes}), and one is"
+                        f" wanted. Give its array: tifffile.imread({path.name!r}), at its place"
+                        f" along axis {first.axes.index(axis)}."
+                    )
+            return first.asarray()
     with Image.open(path) as image:
         # the numbers of a palette are the labels
         return np.asarray(image)
