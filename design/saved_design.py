@@ -82,6 +82,15 @@ def write_design(path: Path, design: FoundDesign, *, colonies: float) -> Path:
     return path
 
 
+def why_unsaved(fixed: Mapping[str, Any]) -> str:
+    """Why no design with these fixed arguments can be saved, or ""."""
+    try:
+        json.dumps(dict(fixed), default=_plain)
+    except tf.InputError as error:
+        return str(error)
+    return ""
+
+
 @checks.known_keywords
 def load_design(
     path: str | Path,

@@ -159,6 +159,18 @@ def test_a_users_own_method_proposes_and_learns():
     assert made.study.entries[0].replicates == 2  # the method requests nine; the task has two
 
 
+def around(make=1.0, decay=1.0, founders=None):
+    return lit(make, decay).replace(founders=founders or tf.Cells.single(2))
+
+
+def test_a_design_that_cannot_be_saved_is_said_before_the_search(capsys):
+    for fixed, said in (({"founders": tf.Cells.single(2)}, True), ({"decay": 0.5}, False)):
+        names = [p for p in LIT if p.name not in fixed]
+        made = Search(around, names, Level(), fixed=fixed, cells=3, replicates=1, finals=None)
+        made.run(2, progress=False)
+        assert ("but not saved: fixed = Cells(1 cell" in capsys.readouterr().err) == said
+
+
 def test_a_search_that_tried_one_design_says_so(capsys):
     made = search()
     made.run(3, progress=False)
