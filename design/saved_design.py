@@ -119,6 +119,10 @@ def load_design(
             f"Import it, and give scene={content['scene']}.",
         )
     function = scene_function(content["scene"] if scene is None else scene)
+    if target is not None and content.get("target") not in (None, target.describe()):
+        raise checks.input_error(
+            "target", target.describe(), f"that of the search: {content['target']}"
+        )
     return SavedDesign(path, content, function, parameters, target)
 
 

@@ -179,7 +179,8 @@ class Table:
             hint = "Leave such cells out."
             if len(bad) == self.rows:
                 needed = "This column is needed: give a number for each cell."
-                hint = "Leave the column out." if optional else needed
+                number = f"Leave the column out, or write 0 for {str(values[0])!r}, 1 for the next."
+                hint = number if optional else needed
             raise checks.InputError(
                 f"{self.place(int(bad[0]))}, column {column!r}: {str(values[bad[0]])!r} is not a"
                 f" number{more}. {hint}"
