@@ -194,7 +194,9 @@ class Objective(metaclass=checks.KnownKeywords):
         every = np.concatenate([np.vstack([p, b]) for p, b in zip(points, beside, strict=True)])
         found = self._grow(every, None, streams, *run)
         first = slice(None, None, each)
-        slopes = differences(space, found.loss.reshape(-1, each)[:, 1:])
+        loss = found.loss.copy()
+        loss[[row for row, _ in found.reasons]] = np.nan  # no slope leads to a failure
+        slopes = differences(space, loss.reshape(-1, each)[:, 1:])
         return replace(
             found,
             points=points, values=found.values[first], losses=found.losses[first],

@@ -140,6 +140,10 @@ def _seeds(task: Task, fresh: FreshLosses) -> str:
     seeds = len(fresh.losses)
     if task.worst:  # no band tells what lies beyond the worst of some seeds; their order does
         return f"the worst of {seeds} seeds; 1 new seed in {seeds + 1} is worse"
+    failed = fresh.losses >= task.target.failed
+    if failed.any() and fresh.loss >= LARGE:  # a mean with failures says nothing of the others
+        others = show_loss(float(fresh.losses[~failed].mean())) if not failed.all() else "none"
+        return f"{failed.sum()} of {seeds} seeds failed; the mean of the others: {others}"
     low, high = fresh.band
     return f"{show_loss(low)} … {show_loss(high)}, {seeds} seeds"
 

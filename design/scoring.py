@@ -227,8 +227,7 @@ def _below_failed(target: Target, score: np.ndarray) -> tuple[np.ndarray, dict[i
         elif number > target.failed:
             why[k] = (
                 f"the target's loss was {number:g}, above {target.failed:g}, that of a failed"
-                f" colony. Give {type(target).__name__} a class attribute `failed` above all its"
-                " losses"
+                " colony. Give your target a class attribute `failed` above all its losses"
             )
     return np.where([k in why for k in range(len(score))], np.nan, score), why
 

@@ -151,11 +151,11 @@ class Search(TaskOptions):
         except KeyboardInterrupt:
             self._report_interrupt(colonies)
             raise
-        self._remark(colonies)
+        self._remark(colonies, holds)
         return self.front() if self.objective.task.goals else self.best()
 
-    def _remark(self, colonies: int) -> None:
-        """Say what makes the outcome of a search worth little."""
+    def _remark(self, colonies: int, holds: bool) -> None:
+        """Say what makes the outcome of a search worth little. holds: it found what was wanted."""
         entries = self.study.entries
         if entries and all(len(e.reasons) == e.losses.size for e in entries):
             reason = self.study.failures()[0][0]
@@ -163,7 +163,7 @@ class Search(TaskOptions):
         remark = (
             getattr(self._progress.chosen.method, "remark", "") if self._progress.chosen else ""
         )
-        if remark:
+        if remark and not holds:
             print(remark, file=sys.stderr)
         each = self.objective.task.replicates
         if sum(len(e.points) for e in entries) == 1 and colonies < 2 * each:

@@ -24,12 +24,13 @@ _found_outside = Course()
 class Exchanged:
     """What the cells of a state exchanged in a step. found: the concentration of each signal at
     each cell as the step began, (N,) by name. given: what each gave to its pool, conc·µm³,
-    (negative: took). pool: (N,) µm³. groups: of the cells by colony."""
+    (negative: took). pool: (N,) µm³. groups: of the cells by colony. step: its number."""
 
     found: Mapping[str, Tensor]
     given: Mapping[str, Tensor]
     pool: Tensor
     groups: Groups
+    step: int
 
     @property
     def swing(self) -> Tensor:
@@ -132,7 +133,7 @@ class MediumExchange:
         """What has been given in this step, without its gradient."""
         given = {n: x.detach() for n, x in (self._given | self._in_loops).items()}
         found = {n: self.found[n].detach() for n in given}
-        return Exchanged(found, given, self.pool.detach(), self.state.groups)
+        return Exchanged(found, given, self.pool.detach(), self.state.groups, self.state.step)
 
     def settle(self, **more: Tensor) -> State:
         """The state in which the medium has what was given to it. more: other fields to

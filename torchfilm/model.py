@@ -29,7 +29,7 @@ from torchfilm.resolver import BoundBatch
 from torchfilm.state import CELL, PER_CELL, Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.hashing import digest
-from torchfilm.tools.row_checks import check_geometry
+from torchfilm.tools.row_checks import check_declared, check_geometry
 from torchfilm.tools.tangents import tracked
 from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.timing import Timings
@@ -180,6 +180,7 @@ class Model:
                 "Bind the scene to the state: scene.bind(state=state).",
             )
         columns = {name: getattr(state, name) for name in PER_CELL}
+        check_declared(state.fields, state.declared)
         check_geometry(columns, state.colonies, state.dim, state.dtype)
         state.check_fields()
         highest = int(state.colony_id.max())

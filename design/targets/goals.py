@@ -367,6 +367,11 @@ class Goals(Several):
         object.__setattr__(self, "parts", parts)
 
     @property
+    def failed(self) -> float:  # type: ignore[override]
+        # above the loss of a colony that breaks a constraint, which counts in all goals
+        return len(self.parts) * max(part.failed for part in self.parts)
+
+    @property
     def titles(self) -> tuple[str, ...]:
         """A short name of each goal, all different."""
         kinds = [type(part).__name__.lower() for part in self.parts]

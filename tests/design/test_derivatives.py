@@ -207,6 +207,12 @@ def test_a_search_that_ends_before_its_first_descent_says_so(colonies, first, ca
     assert (words in capsys.readouterr().err) == (first == 64)
 
 
+def test_a_search_that_found_what_was_wanted_says_nothing_of_descents(capsys):
+    search = Search(lit, TWO, LASTING, cells=8, replicates=2, method=Local(), finals=None)
+    search.run(400, stop_at=1e8)
+    assert "first descent" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("target", [EDGES, LASTING], ids=["at the end", "lasting"])
 def test_slopes_do_not_depend_on_the_batch(target):
     """Each colony alone, and all in one batch, in which larger colonies stand: the same bits."""
@@ -237,7 +243,7 @@ def test_parameters_with_levels_have_no_slope():
 
 def test_where_growth_depends_on_the_design_there_are_differences():
     parameters = [Parameter("rate", 0.5, 2.0), Parameter("make", 0.1, 10.0, log=True)]
-    objective = objective_of(paced, parameters, EDGES, until=1.0, replicates=2)
+    objective = objective_of(paced, parameters, EDGES, until=3.0, replicates=2)
     assert "growth depends on the design" in objective.why_differences
     found = objective.evaluate(POINTS, slopes=True)
     assert found.copies == 5 and np.isnan(found.slopes.curvature).all()
@@ -246,6 +252,15 @@ def test_where_growth_depends_on_the_design_there_are_differences():
     step = np.array([0.0, 0.01])
     more, less = (objective.evaluate(POINTS + s).loss for s in (step, -step))
     assert found.slopes.gradient[:, 1] == pytest.approx((more - less) / 0.02, rel=1e-6)
+    assert not found.reasons and (found.slopes.gradient != 0).all()
+
+
+def test_there_is_no_difference_to_a_colony_that_failed():
+    """After 0.5 h none has the cells of a pattern."""
+    parameters = [Parameter("rate", 0.5, 2.0), Parameter("make", 0.1, 10.0, log=True)]
+    objective = objective_of(paced, parameters, EDGES, until=0.5, replicates=2)
+    found = objective.evaluate(POINTS, slopes=True)
+    assert len(found.reasons) == 4 and np.isnan(found.slopes.gradient).all()
 
 
 def test_derivatives_by_nothing_are_refused():

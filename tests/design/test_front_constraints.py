@@ -97,3 +97,14 @@ def test_large_losses_that_meet_the_constraints_are_not_called_broken():
     best = made.run(colonies=60, progress=False)
     assert best.losses.sum() > Constrained.BROKEN > best.losses.max()
     assert "misses the constraints" not in best.table()
+
+
+def test_a_constraint_beside_a_ready_target_is_no_failure():
+    """Whose own losses end at 1: a colony that breaks the constraint has its loss in all goals."""
+    goals = [
+        Constrained(Level(wanted=1.0), at_least={"mean_level": 5.0}),
+        OnFraction("gfp", 0.5, level=1.0),
+    ]
+    made = Search(lit, LIT, targets=goals, cells=3, replicates=2, method=NSGA2(population=8))
+    made.run(40, progress=False)
+    assert not made.study.failures()

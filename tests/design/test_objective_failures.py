@@ -283,9 +283,7 @@ def test_a_colony_that_grew_never_looks_worse_than_one_that_failed(target):
     )
     assert "too much" in found.reasons[1, 0] and found.losses[1, 0] == target.failed
     if type(target) is FarWithoutRoom:
-        words = (
-            r"loss was [\d.e+]+, above 1.5, that of a failed colony. Give FarWithoutRoom a class"
-        )
+        words = r"loss was [\d.e+]+, above 1.5, that of a failed colony. Give your target a class"
         assert re.search(words, found.reasons[0, 0]) and found.loss[0] == found.loss[1]
     else:
         assert (0, 0) not in found.reasons and found.loss[0] < found.loss[1]

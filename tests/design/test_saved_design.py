@@ -96,7 +96,9 @@ def test_what_needs_code_of_the_user_is_given(tmp_path):
 
 
 def test_another_target_than_that_of_the_search_is_refused(saved):
-    with pytest.raises(tf.InputError, match=r"in 0\.6 of the cells' .*that of the search: gfp above 1 in 0\.5"):
+    with pytest.raises(
+        tf.InputError, match=r"in 0\.6 of the cells' .*that of the search: gfp above 1 in 0\.5"
+    ):
         load_design(saved[1], scene=lit, target=OnFraction("gfp", 0.6, 1.0))
     load_design(saved[1], scene=lit, target=OnFraction("gfp", 0.5, 1.0))
 

@@ -256,3 +256,31 @@ def test_an_error_in_a_rule_has_its_line():
     ):
         with pytest.raises(tf.InputError, match=words):
             growing(tf.Growth(), tf.Rules(rule)).bind()
+
+
+class Stop(tf.SimulationError):
+    pass
+
+
+@pytest.mark.parametrize("error", [Stop("enough"), RuntimeError("")])
+def test_an_error_that_a_rule_raises_on_purpose_stays_what_it_is(error):
+    def stops(cells):
+        raise error
+
+    with pytest.raises(type(error)) as caught:
+        growing(tf.Growth(rate=1.0), tf.Rules(stops)).bind()
+    assert caught.value is error
+
+
+def test_errors_without_words_and_in_what_a_rule_calls():
+    def silent(cells):
+        raise ValueError
+
+    def wrong(cells):
+        cells.growth_rate = cells.colony_max(torch.zeros(3, 4, 5))
+
+    with pytest.raises(tf.InputError, match=r"line \d+ \(raise ValueError\): ValueError$"):
+        growing(tf.Growth(), tf.Rules(silent)).bind()
+    with pytest.raises((tf.InputError, RuntimeError)) as caught:
+        growing(tf.Growth(), tf.Rules(wrong)).bind()
+    assert "ragged.py" not in str(caught.value)

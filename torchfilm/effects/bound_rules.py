@@ -25,7 +25,6 @@ from torchfilm.state import Births, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import HotReload
 from torchfilm.tools.warn_once import warn
-from torchfilm.values import CONCENTRATION
 
 if TYPE_CHECKING:
     from torchfilm.effects.rules import Rules
@@ -45,6 +44,7 @@ HINTS = {
         " plain numbers: write `a if cells.time > 1 else b`."
     ),
 }
+PACKAGE = str(Path(checks.__file__).parents[1])
 TRIAL_STEP = 0.025  # h, the step that a rule sees in its trial
 MEANING = "variable of the user's rules"
 
@@ -78,6 +78,7 @@ class _BoundRule(BoundEffect):
         # what a NaN means in the user's own variables, only the user knows
         self.shared = {n for n, title in binding.declared.items() if title != effect.title}
         self.types: dict[str, tuple[int, ...]] = {}
+        self.species: set[str] = set()
 
     def writes(self) -> tuple[str, ...]:
         return self.traced_writes
@@ -85,6 +86,7 @@ class _BoundRule(BoundEffect):
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         self.others = effects
         self.types = {n: t for e in effects for n, t in e.typed_values().items()}
+        self.species = {n for e in effects for n in getattr(e.effect, "species", ())}
 
     def _check_written(self, read: Collection[str], written: Collection[str]) -> None:
         """Raise InputError, or warn, as at binding, where the function writes what it did not write
@@ -108,9 +110,7 @@ class _BoundRule(BoundEffect):
     def _with_report(self, state: State, rows: Tensor | None, given: Mapping[str, Tensor]) -> State:
         """The state with a report of those values that no effect can use, given to the cells `rows`
         (M,), or to all cells; the state itself where there is no such value."""
-        each = {
-            n: self._unusable(n, value.detach(), state.declared[n]) for n, value in given.items()
-        }
+        each = {n: self._unusable(n, value.detach()) for n, value in given.items()}
         marks = {n: found for n, found in each.items() if found is not None}
         if not marks or not bool(torch.stack(list(marks.values())).any()):
             return state
@@ -139,10 +139,10 @@ class _BoundRule(BoundEffect):
         status[list(words)] = 1
         return state.replace(reports={**state.reports, self.title: RulesReport(status, words)})
 
-    def _unusable(self, name: str, value: Tensor, declared: Field) -> Tensor | None:
+    def _unusable(self, name: str, value: Tensor) -> Tensor | None:
         """Which of these values (M, …) no effect can use, (M,) bool; None: all may be used."""
-        if name == "growth_rate" or declared.unit == CONCENTRATION:
-            return _of_rows(~(value >= 0))
+        if name == "growth_rate" or name in self.species:
+            return ~(value >= 0)
         if name == "drag":
             return ~(value > 0)
         if name == "cell_type" and self.types:
@@ -164,7 +164,7 @@ class _BoundRule(BoundEffect):
         allowed = {
             "growth_rate": "at least 0. To let cells vanish, set remove_flag",
             "drag": "above 0",
-        }.get(name, "at least 0" if bool((value < 0).any()) else "a number")
+        }.get(name, "at least 0" if name in self.species and value < 0 else "a number")
         shown = f"{float(value):g}" if value.dim() == 0 else value.tolist()
         return f"was set to {shown}: it must be {allowed}"
 
@@ -378,24 +378,35 @@ def _own_draws(label: str) -> Iterator[None]:
 
 def _act(rule: Callable[..., None], *views: CellsView | DivisionView) -> None:
     """Calls a rule on its views. Raises RuleError, with the line, if it uses a tensor as one
-    number, or calls a function with what that does not take."""
+    number, or calls a function with what that does not take. Errors of other kinds are raised as
+    they are."""
     try:
         rule(*views)
     except (RuntimeError, ValueError, TypeError) as error:
-        if isinstance(error, checks.InputError):
-            raise
         hint = next((words for part, words in HINTS.items() if part in str(error)), "")
-        # the innermost frame outside torch is a line of the rule
-        at = next(
-            f
-            for f in reversed(traceback.extract_tb(error.__traceback__))
-            if "torch" not in Path(f.filename).parts
-        )
-        said = hint or f"{type(error).__name__}: {str(error).splitlines()[0]}"
-        place = f"{Path(at.filename).name}, line {at.lineno} ({at.line})"
-        raise RuleError(f"{_label(rule) if at.filename == __file__ else place}: {said}") from error
+        own = isinstance(error, checks.InputError) or not isinstance(error, (ValueError, TypeError))
+        if own and not hint:
+            raise
+        raise RuleError(f"{_line_of(error, rule)}: {hint or _first_line(error)}") from error
     for view in views:
         view.check_unharmed()
+
+
+def _line_of(error: Exception, rule: Callable[..., None]) -> str:
+    """The innermost line of the user's that led to an error; the rule, where there is none."""
+    found = [
+        f
+        for f in traceback.extract_tb(error.__traceback__)
+        if not {"torch", "site-packages"} & set(Path(f.filename).parts)
+        and not f.filename.startswith(PACKAGE)
+    ]
+    if not found:
+        return _label(rule)
+    return f"{Path(found[-1].filename).name}, line {found[-1].lineno} ({found[-1].line})"
+
+
+def _first_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}".rstrip(": ")
 
 
 def _read(views: Sequence[DivisionView]) -> set[str]:

@@ -14,10 +14,12 @@ from torchfilm.circuits.dilution import Start
 from torchfilm.effect import Concern
 from torchfilm.medium_exchange import Exchanged
 from torchfilm.state import State
+from torchfilm.tools.threads import one_torch_thread
 
-# Of the pools' swing: from which it is a concern, after how many steps, in colonies of how many
-# cells; and what is fine.
-SWING, LASTING, CROWD, FINE = 0.5, 40, 100, 0.1
+# Of the pools' swing: from which it is a concern, in colonies of how many cells; and what is fine.
+SWING, CROWD, FINE = 0.5, 100, 0.1
+# It is looked at in every eighth step, and lasts if five looks in a row find it.
+LOOK, LASTING = 8, 5
 
 
 @dataclass(frozen=True)
@@ -47,10 +49,15 @@ class CircuitReport:
     def concerns(self) -> list[Concern]:
         """Colonies in which exchange and transport lag behind each other for long. Small ones are
         left out: around a few cells a signal is weak, and its swing says little."""
-        if self.exchanged is None or not self.exchanged.given:
+        exchanged = self.exchanged
+        if exchanged is None or exchanged.step % LOOK or exchanged.groups.owner.numel() < CROWD:
             return []
-        swing = self.swing
-        where = (swing > SWING) & (self.exchanged.groups.counts >= CROWD)
+        crowd = exchanged.groups.counts >= CROWD
+        if not exchanged.given or not bool(crowd.any()):
+            return []
+        with one_torch_thread():  # a sum over few numbers
+            swing = self.swing
+        where = (swing > SWING) & crowd
         return [Concern("swing", where, LASTING, partial(_of_swing, swing))]
 
 

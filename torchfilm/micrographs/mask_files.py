@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchfilm.tools import checks
+from torchfilm.tools.warn_once import warn
 
 EXTRA = f"Images require scikit-image and tifffile: {checks.install('images')}."
 # files of programs that hold more than an image, and how to get at the image
@@ -96,7 +97,7 @@ def _file(path: Path, frame: int | None, what: str) -> np.ndarray:
     if kind == ".nc":
         return _delta_labels(path, frame)
     try:
-        return _array(_read(path, kind), what)
+        return _array(_read(path, kind, frame), what)
     except checks.InputError:
         raise
     except Exception as error:  # the libraries raise errors of many kinds for a broken file
@@ -117,7 +118,7 @@ def _file(path: Path, frame: int | None, what: str) -> np.ndarray:
 STACKS = {"C": "channels", "Z": "planes"}
 
 
-def _read(path: Path, kind: str) -> np.ndarray:
+def _read(path: Path, kind: str, frame: int | None) -> np.ndarray:
     if kind == ".npy":
         return np.load(path, allow_pickle=False)
     try:
@@ -128,14 +129,16 @@ def _read(path: Path, kind: str) -> np.ndarray:
     if kind in (".tif", ".tiff"):
         with tifffile.TiffFile(path) as file:
             first = file.series[0]
-            for axis, what in STACKS.items():
-                sizes = dict(zip(first.axes, first.shape, strict=True))
-                if sizes.get(axis, 1) > 1:
+            sizes = {a: n for a, n in zip(first.axes, first.shape, strict=True) if n > 1}
+            stacks = [axis for axis in sizes if axis not in "YXS"]
+            for axis in [a for a in stacks if a in STACKS]:
+                words = f"{path} is a stack of {sizes[axis]} {STACKS[axis]} (axes {first.axes})"
+                if frame is None or len(stacks) > 1:
                     raise checks.InputError(
-                        f"{path} is a stack of {sizes[axis]} {what} (axes {first.axes}), and one is"
-                        f" wanted. Give its array: tifffile.imread({path.name!r}), at its place"
-                        f" along axis {first.axes.index(axis)}."
+                        f"{words}, and one is wanted. Give the array of one: its part of"
+                        f" tifffile.imread({path.name!r})."
                     )
+                warn(f"{words}; frame={frame} takes one of these. Were they taken at one time?")
             return first.asarray()
     with Image.open(path) as image:
         # the numbers of a palette are the labels

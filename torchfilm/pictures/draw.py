@@ -203,7 +203,7 @@ def add_walls(ax: Axes, walls: Sequence[Mapping[str, Any]], colony: int, view: s
     """Draw the walls of the colony with this id behind its cells.
 
     walls: as in `Results.walls`. Hard walls are lines, soft ones dashed lines. A flat wall ends
-    where it is behind another one; one that is not perpendicular to the view is omitted.
+    where it is behind a hard one; one that is not perpendicular to the view is omitted.
     """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Circle
@@ -225,7 +225,7 @@ def add_walls(ax: Axes, walls: Sequence[Mapping[str, Any]], colony: int, view: s
         if np.hypot(*normal) > 1.0 - 1e-6:
             flat.append((normal, own(wall["offset"]), dashes(wall)))
     for k, (normal, offset, dash) in enumerate(flat):
-        others = [(n, o) for j, (n, o, _) in enumerate(flat) if j != k]
+        others = [(n, o) for j, (n, o, d) in enumerate(flat) if j != k and d == "-"]
         if (ends := _ends(normal, offset, others)) is not None:
             ax.add_artist(Line2D(*ends.T, linestyle=dash, **style))
 

@@ -3,7 +3,7 @@ colonies."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -66,6 +66,14 @@ def check_declaration(name: Any, shape: Any, initial: Any) -> None:
     if not plain and not callable(initial):
         rule = "a number, or a function of a state and rows"
         raise checks.input_error(f"Field({name!r}).initial", initial, rule)
+
+
+def check_declared(fields: Collection[str], declared: Collection[str]) -> None:
+    """Raises InputError for a field that nothing declares."""
+    for name in fields:
+        if name not in declared:
+            hint = "state.declare(tf.Field(…)) adds a field."
+            raise checks.input_error("field", name, "declared", hint)
 
 
 def check_geometry(columns: Mapping[str, Tensor], colonies: int, dim: int, dtype: Any) -> None:
