@@ -93,8 +93,9 @@ def check_geometry(columns: Mapping[str, Tensor], colonies: int, dim: int, dtype
             (colony < 0) | (colony >= colonies) | (colony.diff(prepend=colony[:1]) < 0),
             f"a place from 0 to {colonies - 1}, with the cells of a colony side by side",
         ),
-        "length": (~(columns["length"] >= 0), "at least 0 µm"),
-        "radius": (~(columns["radius"] > 0), "above 0 µm"),
+        # a colony with what is no number fails in its first step, and harms no other
+        "length": (columns["length"] < 0, "at least 0 µm"),
+        "radius": (columns["radius"] <= 0, "above 0 µm"),
     }
     for name, (wrong, rule) in bad.items():
         if bool(wrong.any()):
