@@ -160,9 +160,8 @@ class Search(TaskOptions):
         if entries and all(len(e.reasons) == e.losses.size for e in entries):
             reason = self.study.failures()[0][0]
             print(f"every colony failed; the most frequent reason: {reason}", file=sys.stderr)
-        remark = (
-            getattr(self._progress.chosen.method, "remark", "") if self._progress.chosen else ""
-        )
+        assert self._progress.chosen is not None
+        remark = getattr(self._progress.chosen.method, "remark", "")
         if remark and not holds:
             print(remark, file=sys.stderr)
         each = self.objective.task.replicates

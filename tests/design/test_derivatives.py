@@ -199,20 +199,6 @@ def test_a_descent_finds_a_pattern_that_lasts():
     assert best.loss < lowest + 1e-4
 
 
-@pytest.mark.parametrize("colonies, first", [(16, 64), (24, 4)])
-def test_a_search_that_ends_before_its_first_descent_says_so(colonies, first, capsys):
-    method = Local(first=first)
-    Search(lit, TWO, LASTING, cells=8, replicates=2, method=method, finals=None).run(colonies)
-    words = f"ended before its first descent: the {first} Sobol designs"
-    assert (words in capsys.readouterr().err) == (first == 64)
-
-
-def test_a_search_that_found_what_was_wanted_says_nothing_of_descents(capsys):
-    search = Search(lit, TWO, LASTING, cells=8, replicates=2, method=Local(), finals=None)
-    search.run(400, stop_at=1e8)
-    assert "first descent" not in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("target", [EDGES, LASTING], ids=["at the end", "lasting"])
 def test_slopes_do_not_depend_on_the_batch(target):
     """Each colony alone, and all in one batch, in which larger colonies stand: the same bits."""

@@ -15,11 +15,12 @@ from design import CMAES, NSGA2, Choice, Local, Parameter, Polish, Racing, Searc
 from design.methods import Bayesian, choose
 from design.methods.local import unlike
 from design.slopes import Slopes
-from design.targets import Bands, DomainSize
+from design.targets import Bands, DomainSize, Lasting
 from torchfilm.tools.checks import InputError
 
 EDGES = Bands(("gfp",), (-3.0, 3.0), floor=0.5)
 TWO = [Parameter("make", 0.1, 10.0, log=True), Parameter("decay", 0.1, 5.0)]
+LASTING = Lasting(EDGES, since=0.4)
 ROOM = Room((None, None, None))
 
 
@@ -280,3 +281,17 @@ if find_spec("botorch"):
             assert (mine.points == other.points).all() and (mine.loss == other.loss).all()
         # a batch that was grown in part is chosen again, no other
         assert counts[0] >= 3 and sum(counts[1:]) <= counts[0] + 2, counts
+
+
+@pytest.mark.parametrize("colonies, first", [(16, 64), (24, 4)])
+def test_a_search_that_ends_before_its_first_descent_says_so(colonies, first, capsys):
+    method = Local(first=first)
+    Search(lit, TWO, LASTING, cells=8, replicates=2, method=method, finals=None).run(colonies)
+    words = f"ended before its first descent: the {first} Sobol designs"
+    assert (words in capsys.readouterr().err) == (first == 64)
+
+
+def test_a_search_that_found_what_was_wanted_says_nothing_of_descents(capsys):
+    search = Search(lit, TWO, LASTING, cells=8, replicates=2, method=Local(), finals=None)
+    search.run(400, stop_at=1e8)
+    assert "first descent" not in capsys.readouterr().err

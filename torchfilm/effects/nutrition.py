@@ -24,7 +24,7 @@ from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import why_torch
 from torchfilm.tools.doubling import check_doubling
-from torchfilm.values import Value, is_drawn, numbers, physical
+from torchfilm.values import CONCENTRATION, Value, is_drawn, numbers, physical
 
 CONSTANTS = ("rate", "half", "growth_yield")
 STIFF = run.IntegrationSettings("rosenbrock", 1, 1e-4, 1e-9, 1.0)
@@ -61,7 +61,7 @@ class Monod(Effect):
 
     signal: str
     rate: Value = physical(1.0, unit="1/h", least=0.0)
-    half: Value = physical(1.0, unit="conc", above=0.0)
+    half: Value = physical(1.0, unit=CONCENTRATION, above=0.0)
     growth_yield: Value = physical(1.0, unit="1/conc", above=0.0)
 
     stage = NUTRITION

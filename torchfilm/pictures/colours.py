@@ -13,6 +13,7 @@ from torchfilm.pictures.frames import Frame, unit_of
 from torchfilm.pictures.shapes import VIEWS
 from torchfilm.state import OUTSIDE
 from torchfilm.tools import checks
+from torchfilm.values import CONCENTRATION
 
 ANGLE = "angle"
 VECTORS = ("position", "axis")  # three values of a cell that are no colour
@@ -157,7 +158,7 @@ def default_colour(frame: Frame) -> str:
     types = frame.cells.get("cell_type")
     if types is not None and len(np.unique(types)) > 1:
         return "cell_type"
-    species = (n for n, unit in frame.units.items() if unit == "conc" and n in frame.cells)
+    species = (n for n, unit in frame.units.items() if unit == CONCENTRATION and n in frame.cells)
     return next(species, ANGLE)
 
 
@@ -274,7 +275,7 @@ def scale_of(
     low, high = (seen.low, seen.high) if seen.low <= seen.high else (0.0, 1.0)
     if style.channels is not None and name != style.signal:
         low = min(0.0, low)  # a dark channel means a value of 0
-    limits = given or _wide_enough(low, high, NARROWEST if unit == "conc" else 0.0)
+    limits = given or _wide_enough(low, high, NARROWEST if unit == CONCENTRATION else 0.0)
     under, over = seen.low < limits[0], seen.high > limits[1]
     beyond: Beyond = "both" if under and over else "min" if under else "max" if over else "neither"
     return Scale(name, label, unit, _colour_map(name, style), limits, beyond)
