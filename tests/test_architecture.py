@@ -56,6 +56,7 @@ ROOMS = {
             "torchfilm.scene",
             "torchfilm.model",
             "torchfilm.joined_step",
+            "torchfilm.turns",
             "torchfilm.binding_checks",
             "torchfilm.initial_cells",
             "torchfilm.micrographs",

@@ -92,12 +92,14 @@ def outcome(state: tf.State) -> Tensor:
 
 
 def run(scene: tf.Scene, steps: int, colonies: int = 1) -> tf.State:
-    state = scene.bind(colonies, seed=2, dtype=F64).start()
+    model = scene.bind(colonies, seed=2, dtype=F64)
+    state = model.start()
     for _ in range(steps):
         state = step(scene, state, DT)
         assert all(bool((r.status == 0).all()) for r in state.reports.values())
         if "circuit" in state.reports and state.cells:
-            assert int(state.reports["circuit"].steps.max()) == 1, (
+            turns = max(e.turns for e in model.effects)
+            assert int(state.reports["circuit"].steps.max()) == turns, (
                 "the difference would see other steps"
             )
     return state
@@ -138,6 +140,13 @@ def test_explicit_methods(method):
 @pytest.mark.parametrize("method", ["implicit", "crank_nicolson", "euler"])
 def test_every_way_of_transport(method, name):
     check(lambda x: talking(medium={"method": method}, **{name: x}), OPTIONS[name], steps=3)
+
+
+@pytest.mark.parametrize("name", ["make", "luxi", "diffusion"])
+def test_in_turns_of_circuits_and_transport(name):
+    check(
+        lambda x: talking(medium={"steps": 3}, **{name: x}), {**CONSTANTS, **OPTIONS}[name], steps=3
+    )
 
 
 def test_about_an_obstacle():

@@ -101,7 +101,7 @@ def colony(contacts: str, **more) -> tuple[tf.Effect, ...]:
 
 
 def signalling() -> tf.Scene:
-    scene = tf.scenes.build("quorum_sensing")
+    scene = tf.scenes.quorum_sensing(steps=1)  # one turn of the circuit
     by_torch = lambda e: replace(e, backend="torch") if isinstance(e, tf.Mechanics) else e
     return scene.replace(*(by_torch(e) for e in scene.effects))
 

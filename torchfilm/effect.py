@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
@@ -21,6 +22,7 @@ from torchfilm.resolver import BoundBatch, Resolved, Values, drawn_field, resolv
 from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks, hashing
 from torchfilm.tools.threads import given_torch_threads, one_torch_thread
+from torchfilm.tools.timing import Timings
 from torchfilm.values import CELL, ByType, Rule, checked, is_drawn
 
 if TYPE_CHECKING:
@@ -242,6 +244,7 @@ class BoundEffect:
         self.effect, self.binding = effect, binding
         self.title, self.stage = effect.title, effect.stage
         self.place = 0  # of the effect in its scene
+        self.turns = 1  # of exchange with the medium in a step
         self.values = Values(self._resolve(effect, binding.batch))
 
     @staticmethod
@@ -336,11 +339,23 @@ class BoundEffect:
             raise TypeError(f"{name}.step must return the state; it returned None")
         return made
 
-    def run_step(self, state: State, dt: float) -> State:
-        """As `step`; torch has one thread where kernels compute, and else those it was given."""
-        alone = self.by_kernels and state.device.type == "cpu"
-        with one_torch_thread() if alone else given_torch_threads():
+    def run_step(self, state: State, dt: float, timings: Timings | None = None) -> State:
+        """As `step`, with torch's `threads`, and timed."""
+        with self.timed(state, timings), self.threads(state):
             return self.step(state, dt)
+
+    def timed(self, state: State, timings: Timings | None) -> AbstractContextManager[object]:
+        """The time of this effect, under its title."""
+        return nullcontext() if timings is None else timings.of(self.title, state.device)
+
+    def threads(self, state: State) -> AbstractContextManager[object]:
+        """One torch thread where kernels compute, and else those that torch was given."""
+        alone = self.by_kernels and state.device.type == "cpu"
+        return one_torch_thread() if alone else given_torch_threads()
+
+    def exchanges(self) -> tuple[str, ...]:
+        """The signals that it makes cells exchange with the medium, in one or more `turns`."""
+        return ()
 
     @property
     def by_kernels(self) -> bool:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import nullcontext
 
 import numpy as np
 import torch
@@ -22,6 +21,7 @@ from torchfilm.state import State
 from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.tangents import tracked
 from torchfilm.tools.timing import Timings
+from torchfilm.turns import Turns
 
 
 class JoinedStep:
@@ -33,12 +33,11 @@ class JoinedStep:
 
     def run_step(self, state: State, dt: float, timings: Timings | None) -> State:
         """The state after growth and contacts."""
-        of = lambda effect: timings.of(effect.title, state.device) if timings else nullcontext()
-        with of(self.growth):
+        with self.growth.timed(state, timings):
             found = self._lengthened(state, dt)
             if found is None:
                 state = self.growth.run_step(state, dt)
-        with of(self.mechanics):
+        with self.mechanics.timed(state, timings):
             if found is None:
                 return self.mechanics.run_step(state, dt)
             return self.mechanics.parted(state, dt, *found)
@@ -63,9 +62,9 @@ class JoinedStep:
         return (growth, after) if after.max() < math.inf else None
 
 
-def joined(effects: Sequence[BoundEffect]) -> list[BoundEffect | JoinedStep]:
+def joined(effects: Sequence[BoundEffect | Turns]) -> list[BoundEffect | JoinedStep | Turns]:
     """The effects, in which growth and contacts right after it are joined where they can be."""
-    found: list[BoundEffect | JoinedStep] = []
+    found: list[BoundEffect | JoinedStep | Turns] = []
     for effect in effects:
         before = found[-1] if found else None
         if (

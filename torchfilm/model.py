@@ -34,6 +34,7 @@ from torchfilm.tools.tangents import tracked
 from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.timing import Timings
 from torchfilm.tools.warn_once import once
+from torchfilm.turns import Turns, in_turns
 
 if TYPE_CHECKING:
     from torchfilm.scene import Scene
@@ -95,13 +96,7 @@ class Model:
         alone = one_torch_thread() if self._by_kernels else nullcontext()
         with alone, once(self._said) as self._said:
             for effect in self._parts:
-                if isinstance(effect, JoinedStep):
-                    state = effect.run_step(state, dt, timings)
-                elif timings is None:
-                    state = effect.run_step(state, dt)
-                else:
-                    with timings.of(effect.title, state.device):
-                        state = effect.run_step(state, dt)
+                state = effect.run_step(state, dt, timings)
         return advanced(state, dt)
 
     def opened(self, state: State) -> State:
@@ -113,9 +108,14 @@ class Model:
         return state
 
     @cached_property
-    def _parts(self) -> list[BoundEffect | JoinedStep]:
-        """What a step runs: the effects, some of them joined."""
-        return joined(self.effects)
+    def turns(self) -> list[BoundEffect | Turns]:
+        """The effects in the order of a step, some of them in turns."""
+        return in_turns(self.effects)
+
+    @cached_property
+    def _parts(self) -> list[BoundEffect | JoinedStep | Turns]:
+        """What a step runs: these, some of them joined."""
+        return joined(self.turns)
 
     @cached_property
     def _openers(self) -> list[BoundEffect]:

@@ -142,7 +142,7 @@ class GrowthRecording(metaclass=checks.KnownKeywords):
             kept = state.remove(full.index_select(0, state.colony), "left").replace(ended=())
             noted.append(_change(FIRST, state, kept))
             state = kept
-        for part, effect in enumerate(self.model.effects):
+        for part, effect in enumerate(self.model.turns):
             after = effect.run_step(state, self.dt)
             if after is not state:
                 noted.append(_change(part, state, after))
@@ -249,13 +249,13 @@ class Replay(metaclass=checks.KnownKeywords):
         device = recording.state.device
         self.streams, self.order = torch.sort(torch.tensor(recording.streams, device=device))
         # each effect with its number among the recorded ones, or None if it only follows
-        numbers = iter(range(len(recording.model.effects)))
+        numbers = iter(range(len(recording.model.turns)))
         self.parts = [
-            (e, next(numbers) if e.place in model.recorded else None) for e in model.effects
+            (e, next(numbers) if e.place in model.recorded else None) for e in model.turns
         ]
         # fields of those that only follow; what a recorded effect declares as well is recorded
         recorded = {f.name for e in recording.model.effects for f in e.declares()}
-        following = [e for e, number in self.parts if number is None]
+        following = [e for e in model.effects if e.place not in model.recorded]
         self.own = [f.name for e in following for f in e.declares() if f.name not in recorded]
         # what growth uses: no effect that only follows may change it
         self.fixed = (*PER_CELL, *sorted(recorded))

@@ -65,4 +65,4 @@ def test_a_large_swing_that_lasts_is_warned_of(count, givers, warned):
             pass
     said = [str(w.message) for w in caught if "exchange moves the medium" in str(w.message)]
     assert len(said) == warned
-    assert not said or "times smaller it is a tenth" in said[0]
+    assert not said or "With 15 times as many Medium(steps=…)" in said[0]

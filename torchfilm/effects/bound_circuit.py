@@ -18,7 +18,7 @@ from torchfilm.circuits.compiled_explicit import compiled_explicit
 from torchfilm.circuits.compiled_molecules import compiled_molecules
 from torchfilm.circuits.compiled_step import Surroundings
 from torchfilm.circuits.compiled_stiff import compiled_stiff
-from torchfilm.circuits.dilution import Start, half_way
+from torchfilm.circuits.dilution import Start, half_way, part_way
 from torchfilm.circuits.draws import KeyedDraws
 from torchfilm.circuits.names import label_of, unknown
 from torchfilm.circuits.network import build_network
@@ -78,14 +78,14 @@ class BoundCircuit(BoundEffect):
 
     def reads(self) -> tuple[str, ...]:
         reservoir = [
-            f"{n}_reservoir" for n in self._signals() if f"{n}_reservoir" in self.binding.declared
+            f"{n}_reservoir" for n in self.exchanges() if f"{n}_reservoir" in self.binding.declared
         ]
         return tuple(dict.fromkeys((*super().reads(), *self.traced_reads, *reservoir)))
 
     def writes(self) -> tuple[str, ...]:
-        written = [OUTSIDE + n for n in self._signals()]
+        written = [OUTSIDE + n for n in self.exchanges()]
         reservoir = [
-            f"{n}_reservoir" for n in self._signals() if f"{n}_reservoir" in self.binding.declared
+            f"{n}_reservoir" for n in self.exchanges() if f"{n}_reservoir" in self.binding.declared
         ]
         return (*super().writes(), *written, *reservoir)
 
@@ -96,7 +96,7 @@ class BoundCircuit(BoundEffect):
         each = [v for v in own if v.known_types and (every or v.draw is not None)]
         return {v.name: v.known_types for v in each}
 
-    def _signals(self) -> tuple[str, ...]:
+    def exchanges(self) -> tuple[str, ...]:
         """The signals that cells exchange."""
         return tuple(dict.fromkeys(n for names in self.exchanged.values() for n in names))
 
@@ -142,7 +142,7 @@ class BoundCircuit(BoundEffect):
         self.exchanged = exchanged
         of_networks = [n for made in self.networks.values() for n in made.signals]
         self.signals = tuple(
-            n for n in signals if n in {*seen["s"], *self._signals(), *of_networks}
+            n for n in signals if n in {*seen["s"], *self.exchanges(), *of_networks}
         )
         geometry = {
             g for n in seen["cell"] for g in GEOMETRY.get(n, (n,) if n in state.fields else ())
@@ -259,17 +259,18 @@ class BoundCircuit(BoundEffect):
             "tau_leap": f"molecule by molecule, tau-leaping (ε = 0.03), {molecules}",
             "direct": f"molecule by molecule, one event after the other, {molecules}",
         }
+        count = c.steps * self.turns
         explicit = (
-            f"{c.method}, {c.steps} equal step(s) of {dt / c.steps:g} h; nothing controls its error"
+            f"{c.method}, {count} equal step(s) of {dt / count:g} h; nothing controls its error"
         )
         lines = [said.get(c.method, explicit)]
         why = [f"computed by torch: {x}" for x in self._why_torch()]
         lines += why or ["computed by compiled functions of its equations"]
-        if self._signals():
-            names = ", ".join(self._signals())
+        if self.exchanges():
+            names = ", ".join(self.exchanges())
             lines.append(
                 f"exchanges {names} with each cell's own pool: amounts kept to rounding; first"
-                " order in dt"
+                f" order in dt{f'/{self.turns}' if self.turns > 1 else ''}"
             )
         return lines
 
@@ -278,10 +279,15 @@ class BoundCircuit(BoundEffect):
     def step(self, state: State, dt: float) -> State:
         """Dilution, rates in the cells as they are half way, dilution: of second order in dt, and
         keeps amounts."""
+        return self.turn(state, dt, 0, 1)
+
+    def turn(self, state: State, dt: float, done: int, number: int) -> State:
+        """The state after dt hours, one of a `number` of turns with transport in a step of the
+        scene, of which so many are `done`. Growth dilutes evenly over them."""
         if state.cells == 0:
             return state
         medium = MediumExchange.of(state, self.signals)
-        middle, start = self.begun(state)
+        middle, start = self.begun(state, 1.0 / (number - done))
         report = Failures(state, self.effect.method, dt)
         rows = {k: x for k in self.rates if (x := cells_of_type(state, k)).numel()}
         signals, pool = ({}, None) if medium is None else (medium.found, medium.pool)
@@ -296,16 +302,22 @@ class BoundCircuit(BoundEffect):
                 medium.find()
             same = self._constants(middle)
             cells = [self.cells(middle, rows[k], k, medium=medium, same=same) for k in left]
-            changed = self._by_torch(state, start, cells, medium, report, changed)
+            changed = self._by_torch(state, start, cells, medium, report, changed, done)
         changed[self.effect.volume_field] = start.half.end
         exchanged = None if medium is None else medium.exchanged()
         state = state.with_fields(**changed) if medium is None else medium.settle(**changed)
-        return state.replace(reports={**state.reports, self.title: report.report(exchanged)})
+        made = report.report(exchanged)
+        made = made.after(state.reports[self.title]) if done else made
+        return state.replace(reports={**state.reports, self.title: made})
 
-    def begun(self, state: State) -> tuple[State, Start]:
-        """The cells as they are half way through their growth, and what a step begins with."""
+    def begun(self, state: State, share: float = 1.0) -> tuple[State, Start]:
+        """The cells as they are half way through this share of their growth, and what a step begins
+        with."""
         circuit = self.effect
-        half = half_way(state.length, state.radius, state.fields[circuit.volume_field])
+        volume, length = state.fields[circuit.volume_field], state.length
+        if share < 1.0:
+            length = part_way(length, state.radius, volume, share)
+        half = half_way(length, state.radius, volume)
         each, dtype = ((n, state.fields[n]) for n in self.fields), state.dtype
         fields = {n: x if x.dtype == dtype else x.to(dtype) for n, x in each}
         return (
@@ -321,9 +333,12 @@ class BoundCircuit(BoundEffect):
         medium: MediumExchange | None,
         report: Failures,
         changed: dict[str, Tensor],
+        done: int,
     ) -> dict[str, Tensor]:
         """The species of all cells after these circuits, of what they are after the others."""
         circuit, keys = self.effect, None
+        # each turn draws numbers of its own
+        purpose = f"{circuit.name} turn {done}".strip() if done else circuit.name
         settings = run.IntegrationSettings(
             circuit.method,
             circuit.steps,
@@ -336,7 +351,7 @@ class BoundCircuit(BoundEffect):
         for c in cells:
             rows, whole = c.rows, c.rows.numel() == state.cells
             concentrations = start.concentrations(rows)
-            draw = None if keys is None else keys.of(rows, circuit.name)
+            draw = None if keys is None else keys.of(rows, purpose)
             made = run.step(c, concentrations, report.dt, settings, draw)
             report.note(start, c, made.code, made.steps)
             after = start.half.after if whole else start.half.after.index_select(0, rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -95,13 +96,16 @@ class FirstHalf(_MediumPart):
         self.stage = BEFORE_CELLS
 
     def step(self, state: State, dt: float) -> State:
-        return self.transport.carried(state, dt / 2)
+        return self.transport.carried(state, dt / 2, dt / 2 / self.effect.steps)
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        return [f"over {dt / 2:g} h, by the methods that the main part of transport lists"]
+        whole = len(self.transport.exchanged) < len(self.effect.signals)
+        first = dt / 2 / self.effect.steps if self.transport.exchanged else dt / 2
+        hours = f"{first:g} h" + (f" or {dt / 2:g} h" if whole and first < dt / 2 else "")
+        return [f"over {hours}, by the methods that the main part of transport lists"]
 
     def summary(self) -> str:
-        return "moves signals over the first half of the step, before cells exchange them"
+        return "moves signals before cells exchange them: Strang's first half"
 
 
 class BoundMedium(_MediumPart):
@@ -133,11 +137,25 @@ class BoundMedium(_MediumPart):
         for name in medium.signals:
             self.transport.check(name, state)
 
+    def check_others(self, effects: Sequence[BoundEffect]) -> None:
+        names = [n for effect in effects for n in effect.exchanges()]
+        self.transport.exchanged = frozenset(names)
+        for effect in effects:
+            effect.turns = self.effect.steps if effect.exchanges() else 1
+
     def step(self, state: State, dt: float) -> State:
-        return self.transport.carried(state, dt / 2 if self.effect.halves else dt)
+        return self.turn(state, dt, 0, 1)
+
+    def turn(self, state: State, dt: float, done: int, number: int) -> State:
+        """The state after the next of a `number` of turns with cells, of which so many are `done`:
+        transport up to the middle of the next turn of the cells, or to the end of the step."""
+        part = 0.5 if self.effect.halves else 1.0
+        if done < number - 1:
+            return self.transport.carried(state, 0.0, dt / number)
+        return self.transport.carried(state, part * dt, part * dt / number)
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        return self.effect.numerics(dt, state)
+        return self.effect.numerics(dt, state, self.transport.exchanged)
 
 
 class GridCoverage(_MediumPart):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -40,6 +40,15 @@ class CircuitReport:
     def reason(self, place: int) -> str:
         return self.words[place]
 
+    def after(self, earlier: CircuitReport) -> CircuitReport:
+        """With what failed, and the steps that were taken, earlier in the same step."""
+        return replace(
+            self,
+            status=torch.maximum(earlier.status, self.status),
+            steps=earlier.steps + self.steps,
+            words={**self.words, **earlier.words},
+        )
+
     @property
     def swing(self) -> Tensor:
         """`Exchanged.swing`, (B,); 0 without a medium."""
@@ -66,8 +75,9 @@ def _of_swing(swing: Tensor, ids: Tensor, where: Tensor) -> str:
     return (
         f"colony {', '.join(map(str, ids[where].tolist()[:5]))}: in one step, exchange moves the"
         f" medium at the cells by {worst:.0%} in the mean, which transport and the other cells see"
-        " only afterwards; concentrations there may be off by as much. With a dt"
-        f" {worst / FINE:.0f} times smaller it is a tenth."
+        " only afterwards; concentrations there may be off by as much. With"
+        f" {worst / FINE:.0f} times as many Medium(steps=…), or a dt smaller by as much, it is a"
+        " tenth."
     )
 
 

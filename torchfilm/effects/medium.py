@@ -3,7 +3,7 @@ equations 6 and 7)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -104,12 +104,13 @@ class Medium(Effect):
 
     method: "exponential" (exact if there are no obstacles and flow and decay are uniform),
     "series" (exact), "implicit" (one solve an axis), "crank_nicolson" (the paper's) or "euler".
-    Default: "exponential" where possible, else "series". steps: transport steps within one step of
-    the scene, for accuracy. splitting: "strang", half of transport before exchange with the cells
-    and half after, or "lie", exchange and then transport. Strang makes the error of the signal many
-    times smaller, for one more transport per step. backend: "compiled" kernels or "torch" for
-    transport. Default: compiled where the device is the CPU and Numba is there; gradients always by
-    torch.
+    Default: "exponential" where possible, else "series". splitting: "strang", half of transport
+    before exchange with the cells and half after, or "lie", exchange and then transport. Strang
+    makes the error of the signal many times smaller, for one more transport per step. steps: of
+    transport within one step of the scene. Circuits and transport take turns in each of them: n
+    make the error of exchange n times smaller or better, without a step of growth and contacts
+    more. `Monod` takes its nutrient once. backend: "compiled" kernels or "torch" for transport.
+    Default: compiled where the device is the CPU and Numba is there; gradients always by torch.
     """
 
     signals: Mapping[str, Signal]
@@ -266,7 +267,10 @@ class Medium(Effect):
         """Who computes transport on a device: "compiled" or "torch"."""
         return "torch" if why_torch("Medium", self.backend, device) else "compiled"
 
-    def numerics(self, dt: float, state: State) -> list[str]:
+    def numerics(
+        self, dt: float, state: State, exchanged: Collection[str] = frozenset()
+    ) -> list[str]:
+        """exchanged: the signals that cells and transport move in turns, `steps` of them."""
         assert state.layout is not None
         shape, spacing = state.layout.grid.shape[0].tolist(), state.layout.grid.spacing
         voxels = (
@@ -278,8 +282,12 @@ class Medium(Effect):
         finest = min(sizes, default=spacing[0])
         strang = "half of transport before the cells, half after (Strang)"
         lines.append(strang if self.halves else "cells, then transport (Lie)")
-        part = dt / self.steps / (2 if self.halves else 1)
+        if exchanged and self.steps > 1:
+            names = ", ".join(sorted(exchanged))
+            lines.append(f"{self.steps} turns of circuits and transport in a step, for {names}")
         for name, signal in self.signals.items():
+            whole = not self.halves or (name in exchanged and self.steps > 1)
+            part = dt / self.steps / (1 if whole else 2)
             method, why = self.method_of(name)
             order = f"order {2 if method == 'crank_nicolson' else 1} in steps of {part:g} h"
             order = "exact over a step" if method in EXACT else order
@@ -292,27 +300,28 @@ class Medium(Effect):
             who = self.backend_on(state.device) if method in COMPILED else "torch"
             who = "compiled; by torch where gradients are required" if who == "compiled" else who
             lines.append(f"{name}: {method}, {order} ({why}), {who}; dt·K/h² = {ratio}")
-            lines += self._cost_of_turns(name, dt, state)
+            lines += self._cost_of_turns(name, dt, state, name in exchanged)
         return lines
 
-    def _cost_of_turns(self, name: str, dt: float, state: State) -> list[str]:
+    def _cost_of_turns(self, name: str, dt: float, state: State, often: bool) -> list[str]:
         """What it costs a signal that cells and transport take turns, where that is over 1 %: of
-        the colony that it concerns most. A line, or none."""
+        the colony that it concerns most. A line, or none. often: in each of the medium's steps."""
         signal = self.signals[name]
         if callable(signal.decay) or state.layout is None:
             return []
         grid, strang = state.layout.grid, self.halves
         most = torch.broadcast_tensors(*map(torch.as_tensor, (signal.diffusion, signal.decay)))
         pairs = {(float(k), float(d)) for k, d in zip(*(x.reshape(-1) for x in most), strict=True)}
-        error = lambda step: min(turns_error(k, d, grid, step, strang) for k, d in pairs)
-        if error(dt) > -0.01:
+        error = lambda turns: min(turns_error(k, d, grid, dt / turns, strang) for k, d in pairs)
+        now = enough = self.steps if often else 1
+        if error(now) > -0.01:
             return []
-        enough = dt
         while error(enough) < -0.01:
-            enough /= 2
+            enough *= 2
+        remedy = f"with Medium(steps={enough})" if often else f"in steps of {dt / enough:.2g} h"
         return [
             f"{name}: cells and transport take turns, so a cell finds its own steady signal up to"
-            f" {-100 * error(dt):.2g} % too low; below 1 % in steps of {enough:.2g} h"
+            f" {-100 * error(now):.2g} % too low; below 1 % {remedy}"
         ]
 
     def method_of(self, name: str) -> tuple[str, str]:

@@ -53,6 +53,8 @@ class Transport:
                 else None
             ),
         }
+        # the signals that circuits exchange, in one turn or more of the medium's steps
+        self.exchanged: frozenset[str] = frozenset()
         # weak keys: a grid no longer in use releases its steps
         self.carriers: WeakKeyDictionary[Grid, dict[Any, Carrier]] = WeakKeyDictionary()
 
@@ -84,16 +86,20 @@ class Transport:
         """The initial, source or decay of a signal on every voxel, (nodes,); 0 in obstacles."""
         return _on_grid(self.signals[name], name, what, state)
 
-    def carried(self, state: State, dt: float) -> State:
-        """The state after transport of the signals for dt hours; cells do not change."""
+    def carried(self, state: State, hours: float, turn: float) -> State:
+        """The state after transport, in which cells do not change: of the signals that cells
+        exchange in turns for `turn` hours, in one piece; of the others for so many `hours`, in the
+        medium's steps."""
         assert state.layout is not None
-        grid = state.layout.grid
+        grid, steps = state.layout.grid, self.medium.steps
         changed = {}
         for name in self.signals:
+            part, pieces = (turn, 1) if name in self.exchanged else (hours / steps, steps)
+            if part == 0:
+                continue
             values = state.fields[OUTSIDE + name]
-            part = dt / self.medium.steps
             carriers = [self.carrier(name, state, batch, part) for batch in grid.batches]
-            for _ in range(self.medium.steps):
+            for _ in range(pieces):
                 values = carry(grid, carriers, values)
             changed[OUTSIDE + name] = values
         return state.with_fields(**changed)
