@@ -365,3 +365,11 @@ def test_circuits_of_one_scene_have_noise_of_their_own():
     matrix = torch.corrcoef(torch.stack([first.fields[n] for n in named]))
     # 40 colonies: the standard error of a correlation is 0.16
     assert float((matrix - torch.eye(4)).abs().max()) < 0.5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_constants_that_require_a_gradient_are_warned_of(method):
+    make = torch.tensor(3.0, requires_grad=True)
+    circuit = tf.Circuit(BIRTH_DEATH, species=("m",), method=method, make=make, lose=1.0)
+    with pytest.warns(UserWarning, match=f"'{method}' passes no gradient on.*detach them"):
+        tf.Scene(circuit, dim=2).bind()

@@ -139,6 +139,11 @@ class BoundCircuit(BoundEffect):
                 derivatives=circuit.method == "rosenbrock",
             )
         self._check_constants(seen["p"])
+        if circuit.is_stochastic and self.values.requires_grad:
+            warn(
+                f"Circuit.method = {circuit.method!r} passes no gradient on: numbers of molecules"
+                " are whole. Its constants require one; detach them, or take the default method."
+            )
         self.exchanged = exchanged
         of_networks = [n for made in self.networks.values() for n in made.signals]
         self.signals = tuple(
