@@ -122,7 +122,7 @@ def test_luxi_switches_on_with_density():
         for size in (32.0, 256.0)
     )
     assert torch.equal(crowd.uid, lonely.uid) and crowd.cells >= 8
-    # fully on is (d2 + k3)/(g1 + growth) ≈ 0.9; on the way there, in steps four times as fine and 32
+    # fully on is (d2 + k3)/(g1 + growth) ≈ 0.9; on the way there, in a quarter of the step and 32
     # turns, they have 0.164 or more, and where AHL is lost 0.0044 or less
     assert float(crowd.luxi.min()) > 0.15 > 0.05 > float(lonely.luxi.max())
 

@@ -4,7 +4,7 @@ One service that circuits and nutrition share."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,21 +24,29 @@ _found_outside = Course()
 class Exchanged:
     """What the cells of a state exchanged in a step. found: the concentration of each signal at
     each cell as the step began, (N,) by name. given: what each gave to its pool, conc·µm³,
-    (negative: took). pool: (N,) µm³. groups: of the cells by colony. step: its number."""
+    (negative: took). pool: (N,) µm³. groups: of the cells by colony. step: its number. turns: of
+    circuits and transport in it; `found` and `pool` are of the last."""
 
     found: Mapping[str, Tensor]
     given: Mapping[str, Tensor]
     pool: Tensor
     groups: Groups
     step: int
+    turns: int = 1
+
+    def after(self, earlier: Exchanged | None) -> Exchanged:
+        """With what was given earlier in the same step."""
+        assert earlier is not None
+        given = {n: earlier.given[n] + x for n, x in self.given.items()}
+        return replace(self, given=given, turns=earlier.turns + 1)
 
     @property
     def swing(self) -> Tensor:
-        """How far exchange moved the pools in the step, (B,): |change| over what they held half
-        way, a mean over the cells that exchange; of the signal where it is most."""
+        """How far exchange moved the pools in a turn with transport, (B,): |change| over what they
+        held half way, a mean over the cells that exchange; of the signal where it is most."""
         most = torch.zeros(self.groups.size, dtype=torch.float64, device=self.pool.device)
         for name, amount in self.given.items():
-            change = amount.double() / self.pool.double()
+            change = amount.double() / (self.turns * self.pool.double())
             half_way = self.found[name].double() + 0.5 * change
             share = torch.where(change != 0, change.abs() / half_way.abs().clamp(min=1e-300), 0.0)
             sums = self.groups.sum(torch.stack([share, (change != 0).double()], 1))

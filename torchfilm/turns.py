@@ -16,7 +16,7 @@ from torchfilm.tools.timing import Timings
 
 
 class Turns:
-    """Circuits that exchange signals, and then transport, several times within a step."""
+    """Circuits, and then transport, several times within a step."""
 
     def __init__(self, circuits: Sequence[BoundCircuit], medium: BoundMedium):
         self.circuits, self.medium = circuits, medium
@@ -25,17 +25,23 @@ class Turns:
     def run_step(self, state: State, dt: float, timings: Timings | None = None) -> State:
         """The state after all turns."""
         number = self.medium.effect.steps
-        for done in range(number):
-            for circuit in self.circuits:
-                with circuit.timed(state, timings), circuit.threads(state):
-                    state = circuit.turn(state, dt / number, done, number)
-            with self.medium.timed(state, timings), self.medium.threads(state):
-                state = self.medium.turn(state, dt, done, number)
+        with self.medium.transport.one_step():
+            for done in range(number):
+                for circuit in self.circuits:
+                    with circuit.timed(state, timings), circuit.threads(state):
+                        state = circuit.turn(state, dt / number, done, number)
+                with self.medium.timed(state, timings), self.medium.threads(state):
+                    state = self.medium.turn(state, dt, done, number)
         return state
 
 
 def in_turns(effects: Sequence[BoundEffect]) -> list[BoundEffect | Turns]:
     """The effects, in which circuits and transport act in turns where the medium asks for it."""
     circuits = [e for e in effects if isinstance(e, BoundCircuit) and e.turns > 1]
-    others = [e for e in effects if e not in circuits]
-    return [Turns(circuits, e) if circuits and isinstance(e, BoundMedium) else e for e in others]
+    media = [e for e in effects if isinstance(e, BoundMedium)]
+    if not circuits or not media:
+        return list(effects)
+    # at the place of the last circuit: what comes after circuits still does
+    last, members = circuits[-1], [*circuits, *media]
+    kept = [e for e in effects if e is last or e not in members]
+    return [Turns(circuits, media[0]) if e is last else e for e in kept]

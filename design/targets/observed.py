@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
@@ -187,6 +188,12 @@ class Observed(Target):
         if not isinstance(state, tf.State):
             raise checks.input_error("Observed.from_state(state)", state, "a tf.State")
         require(state, names)
+        if bool((state.counts == 0).any()):
+            place = int(state.counts.argmin())
+            raise tf.InputError(
+                f"Observed.from_state: colony {int(state.colony_id[place])} has no cells, and shows"
+                " nothing to compare. Observe those that have: state.select([…])."
+            )
         if not isinstance(history, Tensor | None):
             rule = "the notes of Observed.note after every step, stacked, or None"
             raise checks.input_error("Observed.from_state(history)", history, rule)
@@ -225,6 +232,13 @@ class Observed(Target):
         length_with_caps = _caps(length_with_caps, like)
         with tf.Results(path) as results:
             table, now = results.table(frame), float(results.times[frame])
+            empty = sorted(set(results.colony_id.tolist()) - set(table["colony"].tolist()))
+        if empty:
+            warnings.warn(
+                f"Observed.from_results: colonies {', '.join(map(str, empty[:8]))} of {path} have"
+                " no cells in this frame and are left out: what is observed is of those that have.",
+                stacklevel=2,
+            )
         columns = {
             "colony": table["colony"],
             "x_um": table["x"],
@@ -288,7 +302,8 @@ class Observed(Target):
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         apart = self.residuals(state, history)
         # column by column: a sum over many columns may depend on the number of rows
-        return sum((a * a for a in apart.unbind(1)), apart.new_zeros(len(apart)))
+        loss = sum((a * a for a in apart.unbind(1)), apart.new_zeros(len(apart)))
+        return torch.where(state.counts > 0, loss, self.failed)
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:

@@ -15,6 +15,8 @@ from design.targets.statistics import SeenCells
 from torchfilm import checks, tables
 
 COLONY, FRAME = "colony", "frame"
+# columns of times; each colony has one
+TIMES = ("time", "time_h", "time_min", "time_s", "timepoint", "t")
 KIND = {"x": "length", "y": "length", "length": "length", "angle": "angle", "age": "time"}
 
 
@@ -42,6 +44,7 @@ def read_table(
     for name in columns:
         checks.choice("Observed(columns)", name, meant)
     _check_one_frame(given, columns)
+    _check_one_time(given, columns)
     found: dict[str, Tensor] = {}
     used: set[tuple[str, str]] = set()
     for name, kind in KIND.items():
@@ -82,6 +85,27 @@ def _check_positive(given: tables.Table, column: str, numbers: np.ndarray, above
         )
 
 
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _check_one_time(table: tables.Table, columns: Mapping[str, str]) -> None:
+    """Raise InputError for a colony that is listed at several times, in a column of times."""
+    owner = _colonies(table, columns)
+    column = next((c for c in table.columns if c.lower() in TIMES), None)
+    if column is None or columns.get(COLONY) == column:
+        return
+    times = np.array([str(x) for x in table.columns[column].tolist()])
+    for colony in [None] if owner is None else np.unique(owner):
+        own = times if owner is None else times[owner == colony]
+        if len(set(own)) > 1:
+            where = "" if owner is None else f" of colony {colony}"
+            raise tf.InputError(
+                f"{table.source} has {len(set(own))} times{where} in the column {column!r}, from"
+                f" {own[0]} to {own[-1]}. Colonies are observed at one time: keep the rows of one."
+            )
+
+
 def _check_one_frame(table: tables.Table, columns: Mapping[str, str]) -> None:
     """Raise InputError for several frames of one movie: their cells are no colony of one time."""
     column = next((c for c in table.columns if c.lower() == FRAME), None)
@@ -119,10 +143,17 @@ def _cells(
 
 
 def _colonies(table: tables.Table, columns: Mapping[str, str]) -> np.ndarray | None:
-    """Which colony each cell belongs to, as given; None: all to one."""
+    """Which colony each cell belongs to, as given but for space around a name; None: all to one."""
     column = columns.get(COLONY, COLONY)
     if column in table.columns:
-        return table.columns[column]
+        given = [x.strip() if isinstance(x, str) else x for x in table.columns[column].tolist()]
+        for row, name in enumerate(given):
+            if name is None or name == "" or name != name:
+                raise tf.InputError(
+                    f"{table.place(row)}, column {column!r}: the cell has no colony. Give it one,"
+                    " or leave its row out."
+                )
+        return np.array([str(x) for x in given] if any(map(_is_text, given)) else given)
     if COLONY in columns:
         raise table.missing(column)
     return None

@@ -370,3 +370,42 @@ def test_several_frames_of_a_table_are_refused():
     table["Frame"] = [1, 1, 2]
     each = Observed.from_table(table, columns={"colony": "Frame"})
     assert (one.colonies, one.cells) == (1, 3) and (each.colonies, each.cells) == (2, 3)
+
+
+def test_several_times_of_one_colony_are_refused():
+    table = {"x_um": [0.0, 5.0, 9.0], "y_um": [0.0, 0.0, 3.0], "time_h": [1.0, 1.0, 2.0]}
+    with pytest.raises(tf.InputError, match=r"2 times in the column 'time_h', from 1.0 to 2.0"):
+        Observed.from_table(table)
+    apart = Observed.from_table(table | {"colony": ["a", "a", "b"]})
+    assert (apart.colonies, apart.cells) == (2, 3)
+    with pytest.raises(tf.InputError, match=r"2 times of colony a in the column 'time_h'"):
+        Observed.from_table(table | {"colony": ["a", "b", "a"]})
+
+
+@pytest.mark.parametrize("missing", [None, "", " ", float("nan")])
+def test_a_cell_without_a_colony_is_refused(missing):
+    table = {"x_um": [0.0, 5.0, 9.0], "y_um": [0.0, 0.0, 3.0]}
+    number = 1.0 if isinstance(missing, float) else "1"
+    with pytest.raises(tf.InputError, match=r"row 3, column 'colony': the cell has no colony"):
+        Observed.from_table(table | {"colony": [number, number, missing]})
+
+
+def test_space_around_the_name_of_a_colony_is_no_part_of_it():
+    table = {"x_um": [0.0, 5.0, 9.0], "y_um": [0.0, 0.0, 3.0], "colony": ["b", " b ", "a"]}
+    assert Observed.from_table(table).colonies == 2
+
+
+def test_a_colony_without_cells(seen, tmp_path):
+    """It fails where it is compared, and shows nothing where it is observed."""
+    state, _ = seen
+    empty = state.remove(state.colony == 1, "left")
+    loss = Observed.from_state(state).loss(empty)
+    assert loss[1] == Observed.failed and float(loss[[0, 2, 3]].max()) < 10.0
+    with pytest.raises(tf.InputError, match=r"colony 1 has no cells.*state.select"):
+        Observed.from_state(empty)
+    apart = tf.Cells([[0.0, 0.0], [9.0, 0.0]], [[1.0, 0.0]] * 2, 2.0, colony=[0, 2])
+    path = tmp_path / "empty.h5"
+    for _ in tf.simulate(colony().replace(founders=apart), until=0.5, record=path):
+        pass
+    with pytest.warns(UserWarning, match=r"colonies 1 of .* have no cells in this frame"):
+        assert Observed.from_results(path).colonies == 2

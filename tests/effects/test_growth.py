@@ -365,3 +365,16 @@ def test_a_wide_normal_is_refused_with_what_to_do():
         tf.InputError, match=r"smallest value of Growth\.rate.* mean − 4 sd.*LogNor"
     ):
         tf.Growth(rate=tf.Normal(1.0, 0.6))
+
+
+@pytest.mark.parametrize(
+    "rate, warned",
+    [(2.0, True), (None, False), (tf.LogNormal(1.0, 0.1), False), (tf.PerColony([1.0, 2.0]), True)],
+)
+def test_a_rate_that_the_first_cells_override_is_warned_of(rate, warned):
+    """Theirs is copied to daughters, but drawn anew where each cell draws one."""
+    cells = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 2.0, extra={"growth_rate": [0.5]})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        tf.Scene(tf.Growth(rate=rate), founders=cells, dim=2)
+    assert any("has no effect: the first cells have" in str(w.message) for w in caught) == warned

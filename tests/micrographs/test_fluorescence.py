@@ -100,6 +100,14 @@ def test_a_frame_is_picked_from_both(tmp_path):
         read(mask, tmp_path / "gfp.tif")
 
 
+def test_stacks_of_unlike_lengths_are_not_paired():
+    """Frame 1 of three and frame 1 of two were probably not taken at one time."""
+    mask = masked()
+    images = np.stack([shone(mask)] * 2)
+    with pytest.raises(tf.InputError, match=r"one of 2 frame\(s\), and .*mask.* one of 3"):
+        read(np.stack([mask] * 3), images, frame=1)
+
+
 def test_an_image_beside_results_of_delta(tmp_path):
     """Its labels end with its last region of interest; its frames have numbers of its own."""
     mask = masked()

@@ -144,6 +144,27 @@ def test_a_table_of_the_mask_gives_the_same_cells():
     assert np.allclose(one.radius, other.radius, atol=0.01)
 
 
+def test_pages_that_were_written_one_by_one_are_frames(tmp_path):
+    pages = [masked(), masked(x=[30.0, 55.0]), masked(x=[30.0, 58.0])]
+    with tifffile.TiffWriter(tmp_path / "pages.tif") as file:
+        for page in pages:
+            file.write(page)
+    with pytest.raises(tf.InputError, match=r"pages\.tif has 3 frames.*from 0 to 2"):
+        read(tmp_path / "pages.tif")
+    for frame in (0, 1, 2, -1):
+        found = read(tmp_path / "pages.tif", frame=frame).position
+        assert np.array_equal(found, read(np.stack(pages), frame=frame).position)
+
+
+def test_images_of_unlike_shapes_in_one_file_are_named(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "two.tif") as file:
+        file.write(masked())
+        file.write(np.zeros((8, 9), np.uint8))
+    with pytest.warns(UserWarning, match=r"two\.tif holds 2 series.*\(8, 9\); the first is taken"):
+        found = read(tmp_path / "two.tif")
+    assert np.array_equal(found.position, read(masked()).position)
+
+
 def test_a_frame_of_a_stack(tmp_path):
     stack = np.stack([masked(), masked(x=[30.0, 55.0])])
     tifffile.imwrite(tmp_path / "stack.tif", stack)

@@ -44,7 +44,7 @@ def half_way(length: Tensor, radius: Tensor, volume: Tensor) -> HalfWay:
     end = capsule.volume(length, radius)
     middle = nearest_root(volume * end)
     longer = middle / (torch.pi * radius * radius) - radius * (4.0 / 3.0)
-    own = torch.where(volume == end, length, longer.clamp(min=0.0))
+    own = _valued(longer, torch.where(volume == end, length, longer.clamp(min=0.0)))
     middle = capsule.volume(own, radius)
     return HalfWay(own, middle, capsule.area(own, radius), volume / middle, middle / end, end)
 
@@ -55,7 +55,12 @@ def part_way(length: Tensor, radius: Tensor, volume: Tensor, share: float) -> Te
     the same bits in any batch."""
     now = volume + (capsule.volume(length, radius) - volume) * share
     part = now / (torch.pi * radius * radius) - radius * (4.0 / 3.0)
-    return torch.where(now == volume, length, part.clamp(min=0.0))
+    return _valued(part, torch.where(now == volume, length, part.clamp(min=0.0)))
+
+
+def _valued(x: Tensor, value: Tensor) -> Tensor:
+    """These values with the derivatives of x."""
+    return value.detach() + (x - x.detach()) if tracked(x) else value
 
 
 @dataclass(frozen=True, eq=False)

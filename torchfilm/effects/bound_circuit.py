@@ -292,7 +292,8 @@ class BoundCircuit(BoundEffect):
         if state.cells == 0:
             return state
         medium = MediumExchange.of(state, self.signals)
-        middle, start = self.begun(state, 1.0 / (number - done))
+        now = state.replace(time=state.time + done * dt) if done else state
+        middle, start = self.begun(now, 1.0 / (number - done))
         report = Failures(state, self.effect.method, dt)
         rows = {k: x for k in self.rates if (x := cells_of_type(state, k)).numel()}
         signals, pool = ({}, None) if medium is None else (medium.found, medium.pool)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchfilm.effect import BEFORE_CELLS, DIVISION, GRID_COVERAGE, Binding, BoundEffect
+from torchfilm.effect import BEFORE_CELLS, CIRCUIT, DIVISION, GRID_COVERAGE, Binding, BoundEffect
 from torchfilm.effects.medium_transport import Transport
 from torchfilm.signals.exchange import spans
 from torchfilm.signals.space import MOST_VOXELS
@@ -99,8 +99,8 @@ class FirstHalf(_MediumPart):
         return self.transport.carried(state, dt / 2, dt / 2 / self.effect.steps)
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        whole = len(self.transport.exchanged) < len(self.effect.signals)
-        first = dt / 2 / self.effect.steps if self.transport.exchanged else dt / 2
+        whole = len(self.transport.in_turns) < len(self.effect.signals)
+        first = dt / 2 / self.effect.steps if self.transport.in_turns else dt / 2
         hours = f"{first:g} h" + (f" or {dt / 2:g} h" if whole and first < dt / 2 else "")
         return [f"over {hours}, by the methods that the main part of transport lists"]
 
@@ -138,24 +138,32 @@ class BoundMedium(_MediumPart):
             self.transport.check(name, state)
 
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
-        names = [n for effect in effects for n in effect.exchanges()]
-        self.transport.exchanged = frozenset(names)
-        for effect in effects:
-            effect.turns = self.effect.steps if effect.exchanges() else 1
+        circuits = [e for e in effects if e.stage == CIRCUIT]
+        if not any(e.exchanges() for e in circuits):
+            return
+        for effect in circuits:
+            effect.turns = self.effect.steps
+        # what acts once in a step before them, such as nutrition, finds its signals half way
+        once = [e for e in effects if BEFORE_CELLS < e.stage < CIRCUIT and e.place != self.place]
+        known = {name for effect in once for name in (*effect.reads(), *effect.writes())}
+        names = [n for n in self.effect.signals if OUTSIDE + n not in known]
+        self.transport.in_turns = frozenset(names)
 
     def step(self, state: State, dt: float) -> State:
-        return self.turn(state, dt, 0, 1)
+        part = 0.5 if self.effect.halves else 1.0
+        return self.transport.carried(state, part * dt, part * dt, self.effect.steps)
 
     def turn(self, state: State, dt: float, done: int, number: int) -> State:
         """The state after the next of a `number` of turns with cells, of which so many are `done`:
         transport up to the middle of the next turn of the cells, or to the end of the step."""
-        part = 0.5 if self.effect.halves else 1.0
+        halves = self.effect.halves
         if done < number - 1:
-            return self.transport.carried(state, 0.0, dt / number)
+            return self.transport.carried(state, None, dt / number, 2 if halves else 1)
+        part = 0.5 if halves else 1.0
         return self.transport.carried(state, part * dt, part * dt / number)
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        return self.effect.numerics(dt, state, self.transport.exchanged)
+        return self.effect.numerics(dt, state, self.transport.in_turns)
 
 
 class GridCoverage(_MediumPart):

@@ -47,6 +47,7 @@ class CircuitReport:
             status=torch.maximum(earlier.status, self.status),
             steps=earlier.steps + self.steps,
             words={**self.words, **earlier.words},
+            exchanged=self.exchanged and self.exchanged.after(earlier.exchanged),
         )
 
     @property
@@ -73,7 +74,7 @@ class CircuitReport:
 def _of_swing(swing: Tensor, ids: Tensor, where: Tensor) -> str:
     worst = float(swing[where].max())
     return (
-        f"colony {', '.join(map(str, ids[where].tolist()[:5]))}: in one step, exchange moves the"
+        f"colony {', '.join(map(str, ids[where].tolist()[:5]))}: exchange moves the"
         f" medium at the cells by {worst:.0%} in the mean, which transport and the other cells see"
         " only afterwards; concentrations there may be off by as much. With"
         f" {worst / FINE:.0f} times as many Medium(steps=…), or a dt smaller by as much, it is a"

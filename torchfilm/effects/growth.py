@@ -100,6 +100,14 @@ class Growth(Effect):
         return ("length", "elongation", *(("growth_rate",) if self.by_type else ()))
 
     def check_scene(self, effects: Sequence[Effect], founders: Any) -> None:
+        redrawn = self.rate is not None and is_drawn(self.rate) and not is_inherited(self.rate)
+        kept = "growth_rate" in founders.extra and not self.by_type and not redrawn
+        if kept and self.rate is not None and bool(numbers(self.rate).any()):
+            warn(
+                f"Growth.rate = {self.rate!r} has no effect: the first cells have a growth_rate of"
+                " their own, which their descendants keep. Write Growth(), or leave theirs out"
+                " (Cells.from_table takes the further columns that fields=[…] names)."
+            )
         others = [e for e in effects if e is not self and not is_own(e)]
         sets = any(e.writes_anything or "growth_rate" in e.writes() for e in others) or len(
             others

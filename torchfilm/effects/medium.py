@@ -17,8 +17,8 @@ from torchfilm.effects.bound_medium import (
     DaughtersCoverage,
     FirstHalf,
     GridCoverage,
-    Transport,
 )
+from torchfilm.effects.medium_transport import EXACT, Transport
 from torchfilm.parameters import number_range
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Open
 from torchfilm.signals.exchange import turns_error
@@ -37,7 +37,6 @@ OnGrid = float | Tensor | Callable[[Tensor], Tensor]
 Flow = Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
 OUTSIDE_CELLS = ("error", "grow", "reservoir")
 SPLITTINGS = ("lie", "strang")
-EXACT = ("exponential", "series")
 
 
 def _bare(flow: Any) -> Any:

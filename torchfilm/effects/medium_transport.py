@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
@@ -25,6 +26,9 @@ from torchfilm.tools.tangents import tracked
 
 if TYPE_CHECKING:
     from torchfilm.effects.medium import Flow, Medium, OnGrid, Signal
+
+# Methods that are exact over a step, whatever its length.
+EXACT = ("exponential", "series")
 
 
 class Transport:
@@ -53,8 +57,9 @@ class Transport:
                 else None
             ),
         }
-        # the signals that circuits exchange, in one turn or more of the medium's steps
-        self.exchanged: frozenset[str] = frozenset()
+        # the signals that take turns with circuits, in the medium's steps
+        self.in_turns: frozenset[str] = frozenset()
+        self._of_step: dict[Any, Carrier] | None = None
         # weak keys: a grid no longer in use releases its steps
         self.carriers: WeakKeyDictionary[Grid, dict[Any, Carrier]] = WeakKeyDictionary()
 
@@ -86,20 +91,25 @@ class Transport:
         """The initial, source or decay of a signal on every voxel, (nodes,); 0 in obstacles."""
         return _on_grid(self.signals[name], name, what, state)
 
-    def carried(self, state: State, hours: float, turn: float) -> State:
-        """The state after transport, in which cells do not change: of the signals that cells
-        exchange in turns for `turn` hours, in one piece; of the others for so many `hours`, in the
-        medium's steps."""
+    def carried(
+        self, state: State, hours: float | None, turn: float | None, pieces: int = 1
+    ) -> State:
+        """The state after transport, in which cells do not change: of the signals that take turns
+        with circuits for `turn` hours, in so many pieces where the method is not exact; of the
+        others for so many `hours`, in the medium's steps. None: not at all."""
         assert state.layout is not None
         grid, steps = state.layout.grid, self.medium.steps
         changed = {}
         for name in self.signals:
-            part, pieces = (turn, 1) if name in self.exchanged else (hours / steps, steps)
-            if part == 0:
+            often = name in self.in_turns
+            whole, count = (turn, pieces) if often else (hours, steps)
+            if whole is None:
                 continue
+            count = 1 if often and self.medium.method_of(name)[0] in EXACT else count
+            part = whole / count
             values = state.fields[OUTSIDE + name]
             carriers = [self.carrier(name, state, batch, part) for batch in grid.batches]
-            for _ in range(pieces):
+            for _ in range(count):
                 values = carry(grid, carriers, values)
             changed[OUTSIDE + name] = values
         return state.with_fields(**changed)
@@ -110,7 +120,10 @@ class Transport:
         numbers = [x for x in self._numbers(name) if isinstance(x, Tensor)]
         numbers += _closure_tensors(self.signals[name], self.flows[name])
         if tracked(*numbers):
-            return self._prepare(name, state, batch, dt)[0]
+            kept, own = {} if self._of_step is None else self._of_step, (name, batch.shape, dt)
+            if own not in kept:
+                kept[own] = self._prepare(name, state, batch, dt)[0]
+            return kept[own]
         known = self.carriers.setdefault(state.layout.grid, {})
         key = (name, batch.shape, dt, state.dtype, torch.is_grad_enabled())
         found = known.get(key)
@@ -121,6 +134,15 @@ class Transport:
             if not own:
                 known[key] = found
         return found
+
+    @contextmanager
+    def one_step(self) -> Iterator[None]:
+        """Within it, what would be made anew for each backward pass is made once."""
+        self._of_step = {}
+        try:
+            yield
+        finally:
+            self._of_step = None
 
     def _numbers(self, name: str) -> list[Any]:
         """The values that a signal's transport depends on; some are tensors."""

@@ -50,6 +50,8 @@ from torchfilm.kernels.scheme import (
     MOST_SOFTER,
     NOT_FINITE,
     OVERLAP,
+    PEAK,
+    PEAKED,
     SHORTER,
     SHRINK,
     SOFTER,
@@ -307,7 +309,7 @@ def _noted(report, error, tolerance):
 @lean
 def _of_colony(base, growth, radius, drag, settings):
     """The margin, the overlap that is wanted, how deep is too deep, all µm, the α of the softest
-    and of the hardest contacts, and the most passes."""
+    and of the hardest contacts with the most overlap that peaks may have, and the most passes."""
     viscosity, length_drag = drag
     wide, across, held, n = 0.0, 0.0, 0.0, base.shape[0]
     for i in range(n):
@@ -320,25 +322,31 @@ def _of_colony(base, growth, radius, drag, settings):
     if held > 0:
         hardest = min(hardest, UNMOVED * target / held)
     passes = 1.0 if settings[SOFT] > 0 else settings[MOST_PASSES]
-    return MARGIN * wide, target, deep, (softest, hardest), passes
+    limits = softest, hardest, max(PEAK * deep, PEAKED * target)
+    return MARGIN * wide, target, deep, limits, passes
 
 
 @lean
 def _following(e, soft, hardness, target, limits):
     """α at which the mean overlap of the contacts that push, with cells and with hard walls, is
-    `target`, µm: harder at once, softer by a factor of two a step. Rows at the ends of stretches do
-    not count: they push little, and would make the mean of the others larger."""
-    total, count = 0.0, 0
-    softest, hardest = limits
+    `target`, µm, and that of the eighth powers at most the third of the limits: harder at once,
+    softer by a factor of two a step. Rows at the ends of stretches do not count: they push little,
+    and would make the mean of the others larger."""
+    total, count, peaks = 0.0, 0, 0.0
+    softest, hardest, most = limits
     for r in range(e.shape[0]):
         pushes = (e[r] < 0) & (soft[r] == HARD)
         total -= e[r] if pushes else 0.0  # without branches: their outcome is not foreseen
+        part = (e[r] / most) ** 2 if pushes else 0.0
+        part *= part
+        peaks += part * part
         count += pushes
     wanted = softest
     if count:
         force = total / count / hardness
+        peak = math.sqrt(math.sqrt(math.sqrt(max(peaks / count, 1e-300))))
         if force > 0:
-            wanted = min(wanted, target / force)
+            wanted = min(wanted, target / force, hardness / peak)
     return max(min(wanted, 2.0 * hardness), hardest)
 
 

@@ -40,13 +40,20 @@ def check_fluorescence(images: Any, background: Any) -> dict[str, Any]:
 
 
 def mean_fluorescence(
-    image: Any, name: str, frame: int | None, mask: np.ndarray, mask_source: str, background: Any
+    image: Any,
+    name: str,
+    frame: int | None,
+    mask: np.ndarray,
+    mask_source: str,
+    frames: int,
+    background: Any,
 ) -> tuple[np.ndarray, float]:
     """The mean pixel value of each region less the background, and the background.
 
-    image, frame: as of the mask. mask: (rows, columns), numbered from 0, the background, to K.
-    Returns (K + 1,), of which the first is that of the background. Raises InputError for an image
-    of another shape, of several colours, or with pixels that are no numbers.
+    image, frame: as of the mask, which is one of so many `frames`. mask: (rows, columns), numbered
+    from 0, the background, to K. Returns (K + 1,), of which the first is that of the background.
+    Raises InputError for an image of another shape, of several colours, with pixels that are no
+    numbers, or of another number of frames.
     """
     what = f"fluorescence[{name!r}]"
     if isinstance(image, (str, Path)) and Path(image).suffix.lower() == DELTA:
@@ -54,7 +61,12 @@ def mean_fluorescence(
     if Path(mask_source).suffix.lower() == DELTA:
         values, source = _beside_delta(image, what, mask.shape)
     else:
-        values, source = read_image(image, frame, what)
+        values, source, count = read_image(image, frame, what)
+        if count != frames:
+            raise checks.InputError(
+                f"{source} is one of {count} frame(s), and {mask_source} one of {frames}: their"
+                " numbers do not stand for the same times. Give the two images themselves."
+            )
     if values.ndim == 3:
         raise checks.InputError(
             f"{source} has {values.shape[-1]} colours a pixel. Give one of them, (rows, columns)."
@@ -81,7 +93,7 @@ def _beside_delta(image: Any, what: str, shape: tuple[int, ...]) -> tuple[np.nda
     """An image of the frame of a file of DeLTA, whose numbers of frames are its own, and whose
     labels end where its last region of interest does."""
     try:
-        values, source = read_image(image, None, what)
+        values, source, _ = read_image(image, None, what)
     except checks.InputError as error:
         raise checks.InputError(
             f"{error} Beside a file of DeLTA, give the image of its frame alone."

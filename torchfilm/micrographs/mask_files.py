@@ -21,8 +21,9 @@ NOT_IMAGES = {
 }
 
 
-def read_image(image: Any, frame: int | None, what: str) -> tuple[np.ndarray, str]:
-    """An image (rows, columns) or (rows, columns, 3 or 4), and a name for messages.
+def read_image(image: Any, frame: int | None, what: str) -> tuple[np.ndarray, str, int]:
+    """An image (rows, columns) or (rows, columns, 3 or 4), a name for messages, and of how many
+    frames it is one.
 
     image: an array, or the path of a file: .tif, .tiff, .png, .jpg, .npy, or DeLTA's .nc, whose
     label images are placed where their regions of interest were. frame: of a stack, −1 is the last;
@@ -33,7 +34,7 @@ def read_image(image: Any, frame: int | None, what: str) -> tuple[np.ndarray, st
         path = Path(image)
         values, source = _file(path, frame, what), str(path)
         if path.suffix.lower() == ".nc":
-            return values, source
+            return values, source, 1
     else:
         values, source = _array(image, what), what if "[" in what else f"the {what}"
     if values.ndim == 3 and values.shape[-1] in (3, 4) and min(values.shape[:2]) > 4:
@@ -50,7 +51,7 @@ def read_image(image: Any, frame: int | None, what: str) -> tuple[np.ndarray, st
     return _one_frame(values, frame, source)
 
 
-def _one_frame(stack: np.ndarray, frame: int | None, source: str) -> tuple[np.ndarray, str]:
+def _one_frame(stack: np.ndarray, frame: int | None, source: str) -> tuple[np.ndarray, str, int]:
     count = len(stack)
     if frame is None:
         if count != 1:
@@ -65,7 +66,8 @@ def _one_frame(stack: np.ndarray, frame: int | None, source: str) -> tuple[np.nd
         frames = "1 frame" if count == 1 else f"{count} frames"
         rule = f"from {-count} to {count - 1}: {source} has {frames}"
         raise checks.input_error("frame", frame, rule)
-    return stack[frame], source if count == 1 else f"{source}, frame {frame % count}"
+    name = source if count == 1 else f"{source}, frame {frame % count}"
+    return stack[frame], name, count
 
 
 def _array(image: Any, what: str) -> np.ndarray:
@@ -139,10 +141,25 @@ def _read(path: Path, kind: str, frame: int | None) -> np.ndarray:
                         f" tifffile.imread({path.name!r})."
                     )
                 warn(f"{words}; frame={frame} takes one of these. Were they taken at one time?")
-            return first.asarray()
+            return _pages(file, path)
     with Image.open(path) as image:
         # the numbers of a palette are the labels
         return np.asarray(image)
+
+
+def _pages(file: Any, path: Path) -> np.ndarray:
+    """The images of a TIFF file: those that were written one by one are a stack."""
+    images = [series.asarray() for series in file.series]
+    like = {(x.shape, x.dtype) for x in images}
+    if len(images) == 1 or (len(like) == 1 and images[0].ndim == 2 and not file.is_ome):
+        return images[0] if len(images) == 1 else np.stack(images)
+    warn(
+        f"{path} holds {len(images)} series of images, of shapes"
+        f" {', '.join(str(x.shape) for x in images[:4])}{', …' if len(images) > 4 else ''}; the"
+        " first is taken. For another give its array, such as"
+        f" tifffile.imread({path.name!r}, series=1)."
+    )
+    return images[0]
 
 
 def _delta_labels(path: Path, frame: int | None) -> np.ndarray:

@@ -51,7 +51,7 @@ def mask_cells(
         raise checks.input_error("drop", drop, "kinds of regions, such as ('border', 'tiny')")
     for name in drop:
         checks.choice("drop", name, tuple(PROBLEMS))
-    values, source = read_image(image, frame, "mask")
+    values, source, frames = read_image(image, frame, "mask")
     # numbered on, since the measures take memory by the greatest label
     labels, flat = np.unique(_labels(values, source), return_inverse=True)
     mask: np.ndarray = flat.reshape(values.shape)
@@ -69,7 +69,7 @@ def mask_cells(
             f"{source}: no cell is left: drop={list(drop)} leaves out all {len(kept)} regions."
         )
     light = {
-        name: mean_fluorescence(given, name, frame, mask, source, background)
+        name: mean_fluorescence(given, name, frame, mask, source, frames, background)
         for name, given in channels.items()
     }
     length, radius = capsule_of_area(regions["area"], regions["along"])

@@ -18,6 +18,8 @@ from torchfilm.kernels.scheme import (
     MOST_HOPS,
     MOST_SOFTER,
     OVERLAP,
+    PEAK,
+    PEAKED,
     SHORTER,
     SHRINK,
     SOFTER,
@@ -44,7 +46,7 @@ from torchfilm.physics.wall_contacts import (
 )
 from torchfilm.tools.ragged import marked
 from torchfilm.tools.reads import numbers, rows_where
-from torchfilm.tools.vectors import safe_norm
+from torchfilm.tools.vectors import nearest_root, safe_norm
 
 
 def contact_steps(given: StepInput) -> StepResult:
@@ -322,16 +324,27 @@ class _OneStep:
 
     def _followed(self, hardness: Tensor, problem, after: Tensor, contacts, walls) -> Tensor:
         """α of each colony at which the mean overlap of its contacts, with cells and with hard
-        walls, is the target: harder at once, softer by a factor of two a step. Rows at the ends of
-        stretches do not count."""
+        walls, is the target, and that of the eighth powers at most a share of what is too deep:
+        harder at once, softer by a factor of two a step. Rows at the ends of stretches do not
+        count."""
         root, soft = self._wall_roots(walls, torch.ones_like(self.given.radius))
         hard = torch.cat([~contacts.far, ~soft & (root >= 1)])  # all: the first pass moves all
         overlap = torch.where(hard, -after, 0.0).clamp(min=0.0).double()
-        both = torch.stack([overlap, (overlap > 0).double()], 1)
-        total = problem.of_rows.sum(both)
-        force = total[:, 0] / total[:, 1].clamp(min=1) / hardness
-        wanted = self.target / torch.where(force > 0, force, 1.0)
-        wanted = torch.where(force > 0, torch.minimum(wanted, self.softest), self.softest)
+        most = torch.maximum(PEAK * self.deep, PEAKED * self.target)
+        powers = overlap / most.index_select(0, problem.of_rows.owner)
+        for _ in range(3):
+            powers = powers * powers
+        each = torch.stack([overlap, (overlap > 0).double(), powers], 1)
+        total, count, peaks = problem.of_rows.sum(each).unbind(1)
+        count = count.clamp(min=1)
+        force = total / count / hardness
+        pushes = force > 0
+        wanted = self.target / torch.where(pushes, force, 1.0)
+        peak = torch.where(pushes, peaks / count, 1.0).clamp(min=1e-300)
+        for _ in range(3):
+            peak = nearest_root(peak)
+        wanted = torch.minimum(wanted, hardness / peak)
+        wanted = torch.where(pushes, torch.minimum(wanted, self.softest), self.softest)
         return torch.maximum(torch.minimum(wanted, 2 * hardness), self.hardest)
 
     def _moved(self, at, move, about, moving, least, number: int) -> StepResult:

@@ -60,7 +60,7 @@ def overlay(
     if depth is None:
         depth = SHALLOW * 2.0 * float(np.median(cells.radius)) if cells.count else 0.0
     checks.number("depth", depth, least=0.0, hint="µm.")
-    image, source = read_image(over, frame, "micrograph")
+    image, source, _ = read_image(over, frame, "micrograph")
     seen = cells.micrograph
     _check_within(cells, seen, image, source)
     rows, columns = image.shape[:2]
