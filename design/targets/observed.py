@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from torch import Tensor
 import torchfilm as tf
 from design.targets.base import Target, require, species_names
 from design.targets.observed_masks import masks_table
-from design.targets.observed_table import read_table
+from design.targets.observed_table import read_table, warn_of_empty
 from design.targets.statistics import (
     LOG_CELLS,
     ColonyStatistics,
@@ -232,13 +231,7 @@ class Observed(Target):
         length_with_caps = _caps(length_with_caps, like)
         with tf.Results(path) as results:
             table, now = results.table(frame), float(results.times[frame])
-            empty = sorted(set(results.colony_id.tolist()) - set(table["colony"].tolist()))
-        if empty:
-            warnings.warn(
-                f"Observed.from_results: colonies {', '.join(map(str, empty[:8]))} of {path} have"
-                " no cells in this frame and are left out: what is observed is of those that have.",
-                stacklevel=2,
-            )
+            warn_of_empty(results, table)
         columns = {
             "colony": table["colony"],
             "x_um": table["x"],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -157,3 +158,14 @@ def _colonies(table: tables.Table, columns: Mapping[str, str]) -> np.ndarray | N
     if COLONY in columns:
         raise table.missing(column)
     return None
+
+
+def warn_of_empty(results: tf.Results, table: Mapping[str, np.ndarray]) -> None:
+    """Warn of colonies of a results file that have no cells in the table of a frame."""
+    empty = sorted(set(results.colony_id.tolist()) - set(table["colony"].tolist()))
+    if empty:
+        warnings.warn(
+            f"Observed.from_results: colonies {', '.join(map(str, empty[:8]))} of {results.path}"
+            " have no cells in this frame and are left out: what is observed is of the others.",
+            stacklevel=4,
+        )
