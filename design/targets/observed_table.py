@@ -45,7 +45,8 @@ def read_table(
     for name in columns:
         checks.choice("Observed(columns)", name, meant)
     _check_one_frame(given, columns)
-    _check_one_time(given, columns)
+    owner = _colonies(given, columns)
+    _check_one_time(given, columns, owner)
     found: dict[str, Tensor] = {}
     used: set[tuple[str, str]] = set()
     for name, kind in KIND.items():
@@ -70,7 +71,7 @@ def read_table(
             f"{given.source} has none of the columns {', '.join(KIND)} or species; it has"
             f" {', '.join(given.columns)}. Name yours by columns={{…}}."
         )
-    return _cells(found, species, _colonies(given, columns))
+    return _cells(found, species, owner)
 
 
 def _check_positive(given: tables.Table, column: str, numbers: np.ndarray, above: bool) -> None:
@@ -86,13 +87,11 @@ def _check_positive(given: tables.Table, column: str, numbers: np.ndarray, above
         )
 
 
-def _is_text(value: object) -> bool:
-    return isinstance(value, str)
-
-
-def _check_one_time(table: tables.Table, columns: Mapping[str, str]) -> None:
-    """Raise InputError for a colony that is listed at several times, in a column of times."""
-    owner = _colonies(table, columns)
+def _check_one_time(
+    table: tables.Table, columns: Mapping[str, str], owner: np.ndarray | None
+) -> None:
+    """Raise InputError for a colony that is listed at several times, in a column of times. owner:
+    which colony each cell belongs to."""
     column = next((c for c in table.columns if c.lower() in TIMES), None)
     if column is None or columns.get(COLONY) == column:
         return
@@ -154,7 +153,8 @@ def _colonies(table: tables.Table, columns: Mapping[str, str]) -> np.ndarray | N
                     f"{table.place(row)}, column {column!r}: the cell has no colony. Give it one,"
                     " or leave its row out."
                 )
-        return np.array([str(x) for x in given] if any(map(_is_text, given)) else given)
+        named = any(isinstance(x, str) for x in given)
+        return np.array([str(x) for x in given] if named else given)
     if COLONY in columns:
         raise table.missing(column)
     return None

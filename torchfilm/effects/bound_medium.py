@@ -150,8 +150,7 @@ class BoundMedium(_MediumPart):
         self.transport.in_turns = frozenset(names)
 
     def step(self, state: State, dt: float) -> State:
-        part = 0.5 if self.effect.halves else 1.0
-        return self.transport.carried(state, part * dt, part * dt, self.effect.steps)
+        return self.turn(state, dt, 0, 1)
 
     def turn(self, state: State, dt: float, done: int, number: int) -> State:
         """The state after the next of a `number` of turns with cells, of which so many are `done`:

@@ -149,17 +149,18 @@ def _read(path: Path, kind: str, frame: int | None) -> np.ndarray:
 
 def _pages(file: Any, path: Path) -> np.ndarray:
     """The images of a TIFF file: those that were written one by one are a stack."""
-    images = [series.asarray() for series in file.series]
-    like = {(x.shape, x.dtype) for x in images}
-    if len(images) == 1 or (len(like) == 1 and images[0].ndim == 2 and not file.is_ome):
-        return images[0] if len(images) == 1 else np.stack(images)
-    warn(
-        f"{path} holds {len(images)} series of images, of shapes"
-        f" {', '.join(str(x.shape) for x in images[:4])}{', …' if len(images) > 4 else ''}; the"
-        " first is taken. For another give its array, such as"
-        f" tifffile.imread({path.name!r}, series=1)."
-    )
-    return images[0]
+    series = file.series
+    like = {(x.shape, x.dtype) for x in series}
+    if len(series) > 1 and len(like) == 1 and len(series[0].shape) == 2 and not file.is_ome:
+        return np.stack([x.asarray() for x in series])
+    if len(series) > 1:
+        warn(
+            f"{path} holds {len(series)} series of images, of shapes"
+            f" {', '.join(str(x.shape) for x in series[:4])}{', …' if len(series) > 4 else ''}; the"
+            " first is taken. For another give its array, such as"
+            f" tifffile.imread({path.name!r}, series=1)."
+        )
+    return series[0].asarray()
 
 
 def _delta_labels(path: Path, frame: int | None) -> np.ndarray:
