@@ -57,6 +57,7 @@ def test_a_copy_for_each_colony():
     assert state.uid.tolist() == [0, 1] * 3 and state.next_uid.tolist() == [2, 2, 2]
 
 
+@pytest.mark.filterwarnings("ignore:colon.* empty:UserWarning")
 def test_a_colony_for_each_cell():
     cells = tf.Cells(
         [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]], [1.0, 0.0], colony=[2, 0, 2, 0]
@@ -472,3 +473,17 @@ def test_a_table_of_results_is_read_back_as_cells(tmp_path):
     again = scene.bind(cells=cells).start()
     assert torch.allclose(again.fields["luxi"], state.fields["luxi"])
     assert torch.allclose(again.length, state.length)
+
+
+# --- numbers of colonies --------------------------------------------------------------------------
+
+
+def test_numbers_that_leave_colonies_empty_are_warned_of():
+    cells = tf.Cells([[0.0, 0.0], [0.0, 3.0]], [1.0, 0.0], colony=[1, 3])
+    with pytest.warns(UserWarning, match="colonies 0, 2 of 4 stay empty.*of colonies 1, 3 only"):
+        assert seed(cells).counts.tolist() == [0, 1, 0, 1]
+
+
+def test_names_are_no_numbers_of_colonies():
+    with pytest.raises(tf.InputError, match=r"colony = 20250131.*below 1000.*np|numpy\.unique"):
+        tf.Cells([[0.0, 0.0], [0.0, 3.0]], [1.0, 0.0], colony=[0, 20250131])

@@ -266,6 +266,7 @@ def test_a_run_that_is_given_up_is_closed_and_complete(tmp_path):
         assert results.steps.tolist() == [0, 10, 13]
 
 
+@pytest.mark.filterwarnings("ignore:colon.* empty:UserWarning")
 def test_colonies_without_cells_are_recorded(tmp_path):
     cells = tf.Cells([[0.0, 0.0]], [1.0, 0.0], colony=[1])
 
@@ -324,3 +325,25 @@ def test_a_reader_survives_a_file_that_is_away_for_a_moment(tmp_path):
         (tmp_path / "away.h5").rename(path)
         results.refresh()
         assert len(results.frame()["uid"]) > 0
+
+
+def test_a_frame_of_results_gives_cells(tmp_path):
+    """In space too, with the recorded axes, levels and types; `fields` picks from the levels."""
+    grown = tf.Scene(
+        tf.Growth(rate=1.0),
+        tf.Division(length=tf.Uniform(3.5, 4.5)),
+        tf.Mechanics(dim=3),
+        tf.Circuit(lambda u, s, p, cell: {"gfp": 2.0 - u.gfp}, species="gfp", initial={"gfp": 1.0}),
+        founders=tf.Cells([[0.0, 0.0, 0.0]], [1.0, 2.0, 2.0]),
+    )
+    *_, state = tf.simulate(grown.bind(2), cells=5, record=tmp_path / "run.h5")
+    with tf.Results(tmp_path / "run.h5") as results:
+        cells, some = results.cells(), results.cells(0, fields=["gfp"])
+        with pytest.raises(tf.InputError, match=r"fields = 'gpf'.*gfp"):
+            results.cells(fields=["gpf"])
+    assert set(cells.extra) == {"gfp", "division_threshold", "growth_rate"}
+    assert set(some.extra) == {"gfp"}
+    again = grown.bind(cells=cells).start()
+    for name in ("colony", "position", "axis", "length", "radius"):
+        assert torch.allclose(getattr(again, name), getattr(state, name)), name
+    assert torch.equal(again.fields["gfp"], state.fields["gfp"])

@@ -16,6 +16,7 @@ from torchfilm.physics.walls import Wall
 from torchfilm.state import CELL_TYPE, RESERVED, Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.tables import Table
+from torchfilm.tools.warn_once import warn
 
 if TYPE_CHECKING:
     from torchfilm.micrographs.record import Micrograph
@@ -95,6 +96,8 @@ class Cells(metaclass=checks.KnownKeywords):
                         f"Cells.{name}[{bad[0]}]", float(values[bad[0]]), "a whole number from 0"
                     )
                 parts[name] = values.astype(np.int64)
+        if "colony" in parts:
+            _check_colonies(parts["colony"])
         for name in self.extra:
             if not name.isidentifier() or name in RESERVED:
                 raise checks.input_error(
@@ -146,6 +149,7 @@ class Cells(metaclass=checks.KnownKeywords):
             index = np.argsort(self.colony, kind="stable")
             colony = self.colony[index]
         counts = np.bincount(colony, minlength=colonies)
+        _warn_of_empty(counts)
         uid = np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)
 
         def tensor(values: np.ndarray, dtype: torch.dtype) -> Tensor:
@@ -367,6 +371,37 @@ class Cells(metaclass=checks.KnownKeywords):
         from torchfilm.micrographs.record import summarise
 
         return summarise(self)
+
+
+# numbers of colonies up to it may leave any out
+MANY = 1000
+
+
+def _check_colonies(colony: np.ndarray) -> None:
+    """Raise InputError for numbers that are names, such as 20250131: a batch holds all up to it."""
+    if colony.size and (greatest := int(colony.max())) >= max(MANY, 10 * colony.size):
+        raise checks.input_error(
+            "Cells.colony",
+            greatest,
+            f"below {max(MANY, 10 * colony.size)}: a batch has all colonies up to that number",
+            "Number them from 0: numpy.unique(colony, return_inverse=True)[1].",
+        )
+
+
+def _warn_of_empty(counts: np.ndarray) -> None:
+    """Warn of colonies without a cell. counts: cells of each colony."""
+    empty, there = np.flatnonzero(counts == 0), np.flatnonzero(counts)
+    if empty.size and there.size:
+        warn(
+            f"{_colonies(empty)} of {len(counts)} {'stays' if empty.size == 1 else 'stay'} empty:"
+            f" the initial cells are of {_colonies(there)} only. Number colonies from 0."
+        )
+
+
+def _colonies(numbers: np.ndarray, most: int = 12) -> str:
+    more = f", … ({len(numbers)} in all)" if len(numbers) > most else ""
+    listed = ", ".join(map(str, numbers[:most].tolist())) + more
+    return f"{'colony' if len(numbers) == 1 else 'colonies'} {listed}"
 
 
 def _array(name: str, given: Any, dtype: type) -> np.ndarray:

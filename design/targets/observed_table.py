@@ -71,7 +71,25 @@ def read_table(
             f"{given.source} has none of the columns {', '.join(KIND)} or species; it has"
             f" {', '.join(given.columns)}. Name yours by columns={{…}}."
         )
+    _check_twice(given, found, owner)
     return _cells(found, species, owner)
+
+
+def _check_twice(
+    given: tables.Table, found: Mapping[str, Tensor], owner: np.ndarray | None
+) -> None:
+    """Raise InputError if two cells of a colony have one centre."""
+    if "x" not in found:
+        return
+    of = np.zeros(given.rows) if owner is None else np.unique(owner, return_inverse=True)[1]
+    places = np.column_stack([of, found["x"], found["y"]])
+    _, first, counts = np.unique(places, axis=0, return_index=True, return_counts=True)
+    again = first[counts > 1]
+    if again.size:
+        raise tf.InputError(
+            f"{given.place(int(again.min()))}: another cell of the colony has the same centre (such"
+            f" cells: {again.size}). Is a cell listed twice? Keep one of each."
+        )
 
 
 def _check_positive(given: tables.Table, column: str, numbers: np.ndarray, above: bool) -> None:

@@ -263,20 +263,22 @@ def _leaps(
         if given <= 0 or not changes:
             continue
         order = max(given, 1.0)
+        losses = [f"{-g!r} * a{j}" for j, g in changes if g < 0]
         read += [
-            f"mean{k} = abs(" + " + ".join(f"{g!r} * a{j}" for j, g in changes) + ")",
+            f"drift{k} = abs(" + " + ".join(f"{g!r} * a{j}" for j, g in changes) + ")",
+            *([f"drift{k} = _most(drift{k}, {' + '.join(losses)})"] if losses else []),
             f"spread{k} = " + " + ".join(f"{g * g!r} * a{j}" for j, g in changes),
         ]
         tests += [
             f"most = _most(EPSILON / {order!r} * x{k}, 1.0)",
-            f"short |= most * total < SHORT * mean{k}",
+            f"short |= most * total < SHORT * drift{k}",
             f"short |= most * most * total < SHORT * spread{k}",
         ]
         more = f" + {order - 1!r} / _most(x{k} - 1.0, 1.0)" if order > 1 else ""
         times += [
             f"change = _most(EPSILON * x{k} / ({order!r}{more}), 1.0)",
             f"if spread{k} > 0:",
-            f"    time = _least(change / mean{k}, change * change / spread{k})",
+            f"    time = _least(change / drift{k}, change * change / spread{k})",
             "    longest = _least(longest, time)",
         ]
     tests += [

@@ -238,14 +238,19 @@ class _Leap:
         return out & (a > 0)
 
     def longest(self, x: Tensor, a: Tensor) -> Tensor:
-        """The time in which no propensity is expected to change by more than ε of it, (M,).
+        """The time in which no propensity is expected to change by more than ε of it, and no
+        species loses more than ε of its molecules, (M,).
 
-        a: (R, M), the propensities of the reactions that may leap.
+        a: (R, M), the propensities of the reactions that may leap. At rest gain and loss cancel in
+        the mean. Leaps that only their noise limits would grow with the molecule numbers, over
+        times in which molecules are replaced: an explicit leap of τ with the loss d spreads a
+        species at rest by 1/(1 − dτ/2).
         """
-        mean, spread = torch.zeros_like(x), torch.zeros_like(x)
+        mean, spread, lost = (torch.zeros_like(x) for _ in range(3))
         for j in range(a.shape[0]):
             gain = self.run.gain[j].unsqueeze(1)
             mean = torch.addcmul(mean, gain, a[j].unsqueeze(0))
+            lost = torch.addcmul(lost, -gain.clamp(max=0.0), a[j].unsqueeze(0))
             spread = torch.addcmul(spread, gain * gain, a[j].unsqueeze(0))
         # the paper's g is the order, plus a term where few molecules of one kind react with each
         # other: 2 + 1/(x − 1) for a pair
@@ -253,7 +258,8 @@ class _Leap:
             self.order > 1, (self.order - 1) / (x - 1).clamp(min=1.0), 0.0
         )
         change = (self.epsilon * x / steep).clamp(min=1.0)
-        time = torch.minimum(change / mean.abs(), change * change / spread)
+        drift = torch.maximum(mean.abs(), lost)
+        time = torch.minimum(change / drift, change * change / spread)
         return torch.where(self.read & (spread > 0), time, torch.inf).amin(0)
 
     def step(

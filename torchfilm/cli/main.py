@@ -89,13 +89,22 @@ def check_options(args: list[str]) -> None:
     command = COMMANDS.get(args[0]) if args else None
     if command is None:
         return
-    fields = [f for f in dataclasses.fields(command) if "Positional" not in str(f.type)]
+    fields = [f for f in _options(command) if "Positional" not in str(f.type)]
     known = {f"--{f.name.replace('_', '-')}": str(f.type) for f in fields}
     off = {f"--no-{name[2:]}" for name, kind in known.items() if kind == "bool"}
     for arg in args[1:]:
         name = arg.partition("=")[0].replace("_", "-")
         if arg.startswith("--") and name not in (*known, *off, "--help"):
             raise unknown_keyword(args[0], arg.partition("=")[0], list(known))
+
+
+def _options(command: type) -> list[dataclasses.Field[Any]]:
+    """The fields of a command, with those of its groups of options."""
+    found = []
+    for known in dataclasses.fields(command):
+        group = known.default_factory
+        found += _options(group) if dataclasses.is_dataclass(group) else [known]
+    return found
 
 
 def gather_repeated(args: list[str]) -> list[str]:

@@ -4,7 +4,6 @@ starts from."""
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 
 import torch
 
@@ -75,18 +74,6 @@ def overlaps_note(cells: Cells) -> str:
     )
 
 
-def empty_colonies_note(path: str, cells: Cells, state: State) -> str:
-    """Which colonies have no cell to start from, and why; empty if all have cells."""
-    empty = torch.nonzero(state.counts == 0).squeeze(1).tolist()
-    if not empty:
-        return ""
-    there = sorted(set(cells.colony.tolist()))
-    return (
-        f"{_colonies(empty)} of {state.colonies} {'stays' if len(empty) == 1 else 'stay'} empty:"
-        f" {path} has cells for {_colonies(there)} only."
-    )
-
-
 def extra_columns_note(path: str, cells: Cells, model: Model) -> str:
     """Which columns of the table become fields that no effect of the scene uses; empty if there is
     none."""
@@ -95,15 +82,9 @@ def extra_columns_note(path: str, cells: Cells, model: Model) -> str:
     extra = [name for name in cells.extra if name not in used]
     if not extra:
         return ""
+    hint = " Delete the columns that you do not need." if path.lower().endswith(".csv") else ""
     return (
         f"{path}: {', '.join(extra)} {'is' if len(extra) == 1 else 'are'} recorded as"
         f" {'a quantity' if len(extra) == 1 else 'quantities'} per cell, which no effect uses."
-        " Delete the columns that you do not need."
+        f"{hint}"
     )
-
-
-def _colonies(numbers: Sequence[int], most: int = 12) -> str:
-    listed = ", ".join(map(str, numbers[:most])) + (
-        f", … ({len(numbers)} in all)" if len(numbers) > most else ""
-    )
-    return f"{'colony' if len(numbers) == 1 else 'colonies'} {listed}"

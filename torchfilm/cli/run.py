@@ -8,7 +8,7 @@ import time
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 import tyro
@@ -16,16 +16,11 @@ from tqdm import tqdm
 
 from torchfilm import pictures, scenes
 from torchfilm.cellmodeller import own_colour
-from torchfilm.cli.report import (
-    empty_colonies_note,
-    extra_columns_note,
-    overlaps_note,
-    summary_table,
-)
+from torchfilm.cli.report import summary_table
 from torchfilm.cli.scene_files import design, load_scene, parse_setting
 from torchfilm.cli.show import check_new, own_picture
+from torchfilm.cli.start_cells import Options, StartCells
 from torchfilm.cli.threads import use_threads
-from torchfilm.initial_cells import Cells
 from torchfilm.io.recorder import Recorder
 from torchfilm.io.results import Results
 from torchfilm.loop import LOOK, STILL, Standstill
@@ -72,15 +67,7 @@ class Run:
     """Accuracy: a file of settings, as `torchfilm tune SCENE --out` writes it."""
     seed: int | None = None
     """Seed of all random numbers; by default 0, or the seed of the design."""
-    start: Path | None = None
-    """CSV or HDF5 file of cells to start from. Units stand in the names of its columns (x_um,
-    angle_rad, …) or in the next three options."""
-    pixel_size: float | None = None
-    """Of --start: its lengths are in pixels of this many µm."""
-    length_unit: str | None = None
-    """Of --start: um, if its lengths are in µm."""
-    angle_unit: str | None = None
-    """Of --start: degrees or radians."""
+    first: Options = field(default_factory=StartCells)
     device: str = "cpu"
     """cpu or cuda."""
     threads: int | None = None
@@ -112,7 +99,7 @@ class Run:
         if unasked:
             cells = DEFAULT_CELLS
         double = self.double or plan.get("dtype") == "float64"
-        start = self._cells()
+        start = self.first.read()
         model = scene.bind(
             self.colonies,
             seed=plan.get("seed", 0) if self.seed is None else self.seed,
@@ -132,8 +119,7 @@ class Run:
                 self.overwrite,
                 "Choose another --out, replace it (--overwrite), or draw none (--no-picture).",
             )
-        if start is not None:
-            print_notes(str(self.start), start, model, state)
+        self.first.print_notes(start, model)
         colour = next((n for n in plan.get("species", ()) if n in state.fields), None)
         go(
             model,
@@ -148,17 +134,6 @@ class Run:
             # sooner than simulate warns of a run that does not end
             full=Standstill(DEFAULT_CELLS, STILL - LOOK) if unasked else None,
         )
-
-    def _cells(self) -> Cells | None:
-        """The cells to start from, if any."""
-        units = {n: getattr(self, n) for n in ("pixel_size", "length_unit", "angle_unit")}
-        if self.start is not None:
-            return read_cells(self.start, **units)
-        for name, given in units.items():
-            if given is not None:
-                option = f"--{name.replace('_', '-')}"
-                raise checks.input_error(option, given, "left out without --start")
-        return None
 
     def _results_file(self, scene: Scene, is_design: bool) -> Path:
         """The path of the results, in a folder that exists: it is made if necessary."""
@@ -240,40 +215,6 @@ class Resume:
             watch=self.watch,
             picture=self.picture,
         )
-
-
-# What messages about a table tell to give, and the same on the command line.
-IN_A_SHELL = (
-    ("pixel_size=…", "--pixel-size"),
-    ('length_unit="um"', "--length-unit um"),
-    ('angle_unit="degrees" or "radians"', "--angle-unit degrees or radians"),
-    ('angle_unit="degrees"', "--angle-unit degrees"),
-    ('angle_unit="radians"', "--angle-unit radians"),
-)
-
-
-def read_cells(path: Path, **units: Any) -> Cells:
-    """The cells of a CSV file, or of an HDF5 file (any other suffix). units: pixel_size,
-    length_unit and angle_unit, as for `Cells.from_table`."""
-    try:
-        read = Cells.from_table if path.suffix == ".csv" else Cells.from_hdf5
-        return read(path, **units)
-    except InputError as error:
-        said = str(error)
-        for words, option in IN_A_SHELL:
-            said = said.replace(words, option)
-        raise InputError(said) from error
-
-
-def print_notes(path: str, cells: Cells, model: Model, state: State) -> None:
-    """Print what a user should know of the cells that a run starts from."""
-    for note in (
-        empty_colonies_note(path, cells, state),
-        extra_columns_note(path, cells, model),
-        overlaps_note(cells),
-    ):
-        if note:
-            print(f"note: {note}")
 
 
 def go(

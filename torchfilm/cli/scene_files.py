@@ -38,7 +38,7 @@ def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -
     saved design (.json). `parameters` replace those of the design. Raises InputError for anything
     else."""
     path = Path(what)
-    if path.suffix == ".json":
+    if path.suffix.lower() == ".json":
         return _scene_of_design(what, parameters)
     if not path.suffix and path.name == what:
         return scenes.build(what, parameters)
@@ -91,7 +91,7 @@ def _hint(path: Path) -> str:
 def _scene_of_design(what: str, parameters: dict[str, Any]) -> Scene:
     plan = design(what)
     home = str(plan.get("file") or plan["scene"])
-    if Path(home).suffix == ".json":
+    if Path(home).suffix.lower() == ".json":
         raise checks.input_error(
             f"scene in {what}", home, "the name of a ready scene, or the path of a Python file"
         )
@@ -133,7 +133,7 @@ def design(what: str) -> dict[str, Any]:
     """The content of a saved design; empty if `what` is not the path of one. Raises InputError if
     the file is missing or is no design."""
     path = Path(what)
-    if path.suffix != ".json":
+    if path.suffix.lower() != ".json":
         return {}
     if not path.is_file():
         raise checks.input_error("scene", what, "the path of a saved design", "No such file.")

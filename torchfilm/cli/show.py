@@ -119,7 +119,7 @@ def check_new(name: str, path: Path, overwrite: bool, hint: str) -> None:
 def check_new_picture(name: str, path: Path) -> None:
     """Raise InputError if a picture cannot be made at this path, or if there is a file."""
     figure_class()
-    if path.suffix not in (".png", ".pdf", ".svg") or not path.parent.is_dir():
+    if path.suffix.lower() not in (".png", ".pdf", ".svg") or not path.parent.is_dir():
         rule = "in a folder that exists, with a name that ends in .png, .pdf or .svg"
         raise checks.input_error(name, str(path), rule)
     check_new(name, path, False, "Choose another.")

@@ -99,6 +99,15 @@ def open_results(path: Path) -> h5py.File:
     return file
 
 
+def is_results(path: Path) -> bool:
+    """Whether a file is HDF5 and says that it is one of torchfilm's results."""
+    try:
+        with _open_hdf5(path) as file:
+            return file.attrs.get("format") == FORMAT
+    except InputError:
+        return False
+
+
 def _open_hdf5(path: Path) -> h5py.File:
     """Open an HDF5 file to read: complete, growing, or left by a killed run."""
     if not path.is_file():

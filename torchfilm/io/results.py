@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 import torch
 
+from torchfilm.initial_cells import Cells
 from torchfilm.io.identity import check_same_scene, declared_fields
 from torchfilm.io.layout import AT_CELLS, INTERNAL_BEFORE, INTERNAL_ENDING_BEFORE
 from torchfilm.io.lineage import Lineage
@@ -194,6 +195,20 @@ class Results(metaclass=checks.KnownKeywords):
         length, radius and the fields per cell."""
         rows = self._rows(self._index(frame))
         return {name: self._read(f"cells/{name}", rows) for name in self._names("cells")}
+
+    def cells(self, frame: int = -1, *, fields: Sequence[str] | None = None) -> Cells:
+        """The cells of one frame, to start another scene from; `state` goes on with the same one.
+        Colonies are numbered by their places in the batch. fields: which recorded fields the cells
+        have, such as species; by default all but those that serve the numerics. Raises InputError
+        for other names."""
+        found = self.frame(frame)
+        own = {n: found.pop(n) for n in ("position", "axis", "length", "radius", "colony")}
+        own["cell_type"] = found.pop("cell_type", None)
+        serving = {*self.internal_fields, "uid", "parent"}
+        known = {n: v for n, v in found.items() if n not in serving and v.ndim == 1}
+        for name in known if fields is None else fields:
+            checks.choice("fields", name, tuple(known))
+        return Cells(**own, extra={n: known[n] for n in (known if fields is None else fields)})
 
     def colony_fields(self, frame: int = -1) -> dict[str, np.ndarray]:
         """The fields per colony of one frame by name, each (B, …)."""

@@ -292,7 +292,8 @@ def _check_header(path: Path, line: int, names: Sequence[str]) -> None:
         if len(names) == 1 and mark in names[0]:
             raise checks.InputError(
                 f"{path}, line {line}: columns are separated by {word}. Write commas between them,"
-                " and decimal points."
+                f' and decimal points; or give pandas.read_csv("{path.name}", sep={mark!r},'
+                " decimal=…) in place of the path."
             )
     if all(map(_is_number, names)):
         raise checks.InputError(
