@@ -83,6 +83,8 @@ class Library:
         if not there:
             hint = "A UCF has the collection 'gates'; files of inputs and outputs come with it."
             raise checks.input_error("file", records.files, "a library with gates", hint)
+        if isinstance(gates, str):
+            raise checks.input_error("gates", gates, "a tuple of names", f"gates=({gates!r},).")
         for name in gates or ():
             if name not in there:
                 near = checks.nearest(str(name), there)

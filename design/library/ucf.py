@@ -129,12 +129,17 @@ class Records:
             raise Record(data, f"{file}, {collection}, record {number}").error("it has no 'name'.")
         what = f"{file}, {collection} {name!r}"
         # several files of one library repeat its functions and parts
-        if name in there and _plain(there[name].data) != _plain(data):
+        if name in there and _plain(_read(there[name].data)) != _plain(_read(data)):
             if collection == "gates":
                 raise tf.InputError(f"{what} is given twice, and the two differ.")
             # a part that no gate uses does no harm
             self._unclear.setdefault(collection, set()).add(name)
         there[name] = Record(data, what)
+
+
+def _read(data: dict[str, Any]) -> dict[str, Any]:
+    """What is read of a record: variables of functions are only listed."""
+    return {key: value for key, value in data.items() if key != "variables"}
 
 
 def _load(file: Path) -> list[Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
@@ -69,7 +70,7 @@ class PartsList:
         return "\n".join(lines)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Wiring:
     """A wiring of NOR gates, to be filled with gates of a library. `Library.wiring` makes it.
 
@@ -81,6 +82,10 @@ class Wiring:
     sensors: Mapping[str, Sensor]
     growth: float
     loss: float
+
+    def __repr__(self) -> str:
+        of = ", ".join(f"{place} = {self.assigner.netlist.words(place)}" for place in self.places)
+        return f"Wiring({len(self.places)} gates: {of}; {len(self.assigner.gates)} to choose from)"
 
     @property
     def places(self) -> tuple[str, ...]:
@@ -108,6 +113,7 @@ class Wiring:
         """A table of the levels at steady state in each state of the inputs, RPU: the activity of
         each promoter, and the level of the output."""
         netlist, chosen = self.assigner.netlist, self.gates(design)
+        self._warn_of_others(design, chosen)
         found = self.assigner.levels(chosen)
         names = [*netlist.inputs, *self.places, netlist.output]
         titles = [*names[: len(netlist.inputs)], *(chosen[p].name for p in self.places), names[-1]]
@@ -121,6 +127,7 @@ class Wiring:
         """The DNA parts of a design: for each gene the promoters in front of it, then what the
         library lists, such as ribozyme, RBS, coding sequence and terminator."""
         netlist, chosen = self.assigner.netlist, self.gates(design)
+        self._warn_of_others(design, chosen)
         promoters: dict[str, tuple[Part, ...]] = {
             name: device.promoters or (Part("promoter", device.name),)
             for name, device in self.assigner.sensors.items()
@@ -151,8 +158,9 @@ class Wiring:
         """
         designs, each = self._designs(gates)
         chosen = [self.gates(design) for design in designs]
-        for design in chosen:
+        for wished, design in zip(designs, chosen, strict=True):
             self._check_fit(design)
+            self._warn_of_others(wished, design)
         column = lambda numbers: (
             numbers[0]
             if each is None
@@ -181,6 +189,17 @@ class Wiring:
             rtol=rtol,
             **constants,
         )
+
+    def _warn_of_others(self, design: Mapping[str, str], chosen: Mapping[str, Gate]) -> None:
+        """Warn of gates that others stand in for."""
+        other = [f"{n} = {chosen[n].name}" for n in self.places if chosen[n].name != design[n]]
+        if other:
+            warnings.warn(
+                f"the gates {', '.join(design[n] for n in self.places)} would use a repressor"
+                f" twice, or their levels would not fit: {', '.join(other)}"
+                f" stand{'s' if len(other) == 1 else ''} in. resolve(design) gives those in use.",
+                stacklevel=3,
+            )
 
     def _rates(self) -> Callable[..., dict[str, Any]]:
         netlist, scale = self.assigner.netlist, self.assigner.reporter.scale

@@ -172,6 +172,13 @@ def _colonies(table: tables.Table, columns: Mapping[str, str]) -> np.ndarray | N
                     " or leave its row out."
                 )
         named = any(isinstance(x, str) for x in given)
+        odd = [x for x in dict.fromkeys(given) if isinstance(x, str) and not x.isdigit()]
+        if odd and any(isinstance(x, str) and x.isdigit() for x in given):
+            warnings.warn(
+                f"{table.source}, column {column!r}: {', '.join(odd[:8])} among numbers counts as"
+                " colonies of their own. Leave such rows out if they are none.",
+                stacklevel=5,
+            )
         return np.array([str(x) for x in given] if named else given)
     if COLONY in columns:
         raise table.missing(column)

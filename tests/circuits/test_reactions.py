@@ -272,3 +272,27 @@ def test_both_ways_of_running_agree():
     assert (report.status == DONE).all()
     # a mass action rate k c² takes two molecules an event: d[a]/dt = −2 k [a]²
     assert array(counts.mean(0)) / molecules_per_unit == pytest.approx(array(u)[0], rel=0.01)
+
+
+@pytest.mark.parametrize("method", ["rosenbrock", "direct"])
+@pytest.mark.parametrize("rate", [lambda u, s, p, cell: p.k, lambda u, s, p, cell: 2.0])
+def test_the_function_of_a_reaction_may_give_one_number(rate, method):
+    circuit = tf.Circuit([tf.Reaction({}, {"a": 1}, rate)], species="a", method=method, k=2.0)
+    column = torch.ones(3, dtype=torch.float64)
+    found = circuit.graph.evaluate({"a": column, "k": 2.0})
+    assert (torch.zeros(3) + found["a"]).tolist() == [2.0] * 3
+
+
+@pytest.mark.parametrize("rate", [lambda u, s, p, cell: {"a": u.a}, lambda u, s, p, cell: None])
+def test_the_function_of_a_reaction_gives_no_rates_by_name(rate):
+    circuit = tf.Circuit([tf.Reaction({}, {"a": 1}, rate)], species="a")
+    with pytest.raises(tf.InputError, match=r"reaction 0 -> a.*returned.*one rate for each cell"):
+        tf.Scene(circuit).bind().start()
+
+
+def test_a_constant_of_mass_action_is_not_negative():
+    """Also where it is a parameter, in a part; in a function it may be."""
+    part = [[tf.Reaction.of("a -> b", "k")]]
+    with pytest.raises(tf.InputError, match=r"Circuit\.k = -1\.0.*at least 0"):
+        tf.Circuit(part, species=("a", "b"), k=-1.0)
+    tf.Circuit(lambda u, s, p, cell: {"a": p.k * u.a}, species="a", k=-1.0)

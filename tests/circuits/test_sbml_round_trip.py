@@ -139,3 +139,36 @@ def test_a_changed_function_is_not_torchfilms(tmp_path):
     changed = text[:start] + text[start:].replace("<cn>1.0</cn>", "<cn>2</cn>", 1)
     (tmp_path / "a.xml").write_text(changed)
     assert "sigmoid" not in str(tf.Circuit.from_sbml(tmp_path / "a.xml").graph)
+
+
+def test_dilution_is_written_on_request(tmp_path):
+    """As −dilution · x in the rates of what growth dilutes, so that the model read again has it."""
+    circuit = tf.Circuit(
+        lambda u, s, p, cell: {"a": p.k - u.a}, species=("a", "b", "c"), initial={"a": 2.0},
+        k=3.0, dilution=("a", "b"),
+    )  # fmt: skip
+    circuit.to_sbml(tmp_path / "written.xml", dilution=0.5)
+    again = tf.Circuit.from_sbml(tmp_path / "written.xml")
+    found = again.graph.evaluate({"a": torch.tensor([2.0]), "b": torch.tensor([4.0]), "k": 3.0})
+    assert {n: float(x) for n, x in found.items()} == {"a": 0.0, "b": -2.0}
+    assert again.diluted_fields == set() or not again.diluted_fields
+    with pytest.raises(tf.InputError, match=r"dilution = -1.*at least 0"):
+        circuit.to_sbml(tmp_path / "written.xml", dilution=-1)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [({"initial": {"k": -1}}, r"initial 'k' = -1.*at least 0"), ({"k": float("nan")}, "'k' = nan")],
+)
+def test_numbers_that_could_not_be_read_again_are_not_written(tmp_path, given, said):
+    with pytest.raises(tf.InputError, match=said):
+        CIRCUITS["one name for two"]().to_sbml(tmp_path / "written.xml", **given)
+    assert not (tmp_path / "written.xml").exists()
+
+
+def test_models_in_antimony_that_are_left_out_are_named():
+    models = "model first\n A=1; A->; A\nend\nmodel second\n B=2; B->; B\nend\n"
+    with pytest.warns(UserWarning, match=r"several models: second is read, and not first\."):
+        assert tf.Circuit.from_antimony(models).species == ("B",)
+    part = models + "model third\n part: first(); other: second(); C=1; C->; C\nend\n"
+    assert len(tf.Circuit.from_antimony(part).species) == 3

@@ -7,6 +7,7 @@ import itertools
 import math
 import pickle
 import random
+import warnings
 
 import pytest
 import torch
@@ -252,6 +253,20 @@ def test_levels_that_cannot_be_told_apart_make_a_design_unfit(library):
     wiring = xor(library, contrast=1e4)
     with pytest.raises(UnfitDesign, match="the levels of yfp cannot be told apart: on is"):
         wiring.circuit(GOOD)
+
+
+def test_gates_that_others_stand_in_for_are_warned_of(library):
+    """A design that a person writes down is not that which is simulated and printed."""
+    wiring, good = xor(library), xor(library).resolve(GOOD)
+    first = next(iter(good.values()))
+    twice = dict.fromkeys(wiring.places, first)
+    for use in (wiring.circuit, wiring.parts, wiring.levels):
+        with pytest.warns(UserWarning, match=f"the gates {first}, {first}.* stand in"):
+            use(twice)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            use(good)
+    assert len(repr(wiring)) < 300 and "g1 = NOR" in repr(wiring)
 
 
 @pytest.mark.parametrize(

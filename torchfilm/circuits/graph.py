@@ -4,7 +4,7 @@ it conserves."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -177,6 +177,15 @@ class CircuitGraph:
             slopes = derivatives(self.builder, rows.values(), leaf)
             found |= {(n, text(leaf)): slopes[e] for n, e in rows.items() if e in slopes}
         return found
+
+    def diluted(self, species: Sequence[str], rate: float) -> CircuitGraph:
+        """The same equations with −rate · x for each of some species."""
+        make = self.builder.simple
+        rates = dict(self.rates)
+        for name in species:
+            lost = make("mul", rate, self.builder.name(f"u.{name}"))
+            rates[name] = make("sub", rates.get(name, 0.0), lost)
+        return replace(self, rates={n: rates[n] for n in self.species if n in rates})
 
     def evaluate(self, values: Mapping[str, Any]) -> dict[str, Tensor]:
         """The rates, and as "out.name" what is released, at values by name: of species and

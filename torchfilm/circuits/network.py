@@ -43,7 +43,7 @@ class Network:
         out = []
         for reaction in self.reactions:
             if callable(reaction.rate):
-                out.append(reaction.rate(u, s, p, cell))
+                out.append(_rate(reaction, u, s, p, cell))
                 continue
             constant = per_cell(reaction.rate, p, cell, cell.volume)
             rate = torch.zeros_like(cell.volume) + constant
@@ -119,7 +119,7 @@ class Network:
         out = []
         for reaction in self.reactions:
             if callable(reaction.rate):
-                out.append(reaction.rate(u, s, p, cell) * size)
+                out.append(_rate(reaction, u, s, p, cell) * size)
                 continue
             rate = per_cell(reaction.rate, p, cell, size) * size
             # first what molecules do not change: compiled functions work it out once a cell
@@ -131,6 +131,20 @@ class Network:
                 rate = rate * falling(columns[column[name]].floor(), order)
             out.append(rate)
         return out
+
+
+def _rate(reaction: Reaction, u: Names, s: Names, p: Names, cell: Names) -> Any:
+    """What the function of a reaction gives: a column, also where it is one number for all cells.
+    Raises InputError for what is no number."""
+    assert callable(reaction.rate)
+    rate = reaction.rate(u, s, p, cell)
+    one = isinstance(rate, (int, float)) or (isinstance(rate, Tensor) and rate.dim() == 0)
+    if rate is None or isinstance(rate, (str, dict, list, tuple)):
+        raise checks.InputError(
+            f"the rate of the reaction {reaction} is a function that returned"
+            f" {type(rate).__name__}: it must return one rate for each cell, such as p.k * u.a."
+        )
+    return torch.zeros_like(cell.volume) + rate if one else rate
 
 
 def _flatten(entry: Sequence[Any]) -> list[Reaction]:

@@ -34,6 +34,7 @@ from torchfilm.effects.circuit_checks import (
     check_species,
     diluted_names,
     equations_of,
+    mass_action_constants,
     names_of,
     no_cells_of,
     shared_fields,
@@ -128,7 +129,7 @@ class Circuit(Effect):
         checks.choice("Circuit.daughters", daughters, ("concentration", "amount"))
         if name and not (isinstance(name, str) and name.isidentifier()):
             raise checks.input_error("Circuit.name", name, 'an identifier, such as "toggle"')
-        first = Rule(least=0.0)
+        first, mass_action = Rule(least=0.0), mass_action_constants([*by_type.values()])
         given = {
             "rates": {k if isinstance(k, str) else int(k): part for k, part in by_type.items()},
             "species": names,
@@ -147,7 +148,10 @@ class Circuit(Effect):
             "molecules_per_unit": checked(
                 "Circuit.molecules_per_unit", molecules_per_unit, Rule(above=0.0, scope=COLONY)
             ),
-            "parameters": {n: checked(f"Circuit.{n}", v, Rule()) for n, v in parameters.items()},
+            "parameters": {
+                n: checked(f"Circuit.{n}", v, first if n in mass_action else Rule())
+                for n, v in parameters.items()
+            },
         }
         for key, value in given.items():
             object.__setattr__(self, key, value)
@@ -215,18 +219,20 @@ class Circuit(Effect):
         *,
         cell_type: int | None = None,
         initial: Mapping[str, float] | None = None,
+        dilution: float | None = None,
         **values: float,
     ) -> None:
         """Write the equations as an SBML model (Level 3 Version 2), in hours. `from_sbml` reads
-        the same circuit again: the same equations and numbers.
+        the same circuit again: the same equations and numbers. A list of reactions becomes rates.
 
         cell_type: whose rates and constants, where they differ. initial, and further keywords:
-        numbers by name in place of first values and constants that are not one number. Raises
+        numbers by name in place of first values and constants that are not one number. dilution:
+        1/h; the rates then contain −dilution · x, for programs whose cells do not grow. Raises
         InputError where a number is missing, and where rates cannot be written as equations.
         """
         from torchfilm.effects import circuit_sbml
 
-        circuit_sbml.write_file(path, self, cell_type, initial or {}, values)
+        circuit_sbml.write_file(path, self, cell_type, initial or {}, dilution, values)
 
     @property
     def title(self) -> str:  # type: ignore[override]

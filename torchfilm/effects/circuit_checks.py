@@ -8,6 +8,7 @@ from typing import Any
 
 from torchfilm.circuits import integrators
 from torchfilm.circuits.names import unknown
+from torchfilm.circuits.reactions import Reaction
 from torchfilm.state import PER_CELL, RESERVED
 from torchfilm.tools import checks
 from torchfilm.values import FORMS
@@ -65,6 +66,14 @@ def _meaning(name: str) -> str:
         return f"{name!r} is the place of a cell"
     of_cells = name in (*PER_CELL, *GEOMETRY)
     return f"{name!r} is the {name} of a cell" if of_cells else f"the state uses {name!r} itself"
+
+
+def mass_action_constants(part: object) -> set[str]:
+    """The names of parameters that are constants of mass action, in a part of a circuit."""
+    if isinstance(part, Reaction):
+        return {part.rate} if isinstance(part.rate, str) else set()
+    each = part if isinstance(part, (list, tuple)) else ()
+    return set().union(*map(mass_action_constants, each))
 
 
 def check_rates(by_type: Mapping[int | str, Any], typed: bool) -> None:

@@ -3,6 +3,7 @@ a program that does neither starts sooner."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -107,14 +108,15 @@ def written_numbers(
     circuit's own. Raises InputError that names all of which there is not one number."""
     found: list[dict[str, float]] = []
     lacking: list[dict[str, str]] = []
-    for what, own, given, names in (
-        ("initial", circuit.initial, initial, circuit.species),
-        ("constant", circuit.parameters, values, tuple(circuit.parameters)),
+    for what, own, given, names, least in (
+        ("initial", circuit.initial, initial, circuit.species, 0.0),
+        ("constant", circuit.parameters, values, tuple(circuit.parameters), -math.inf),
     ):
-        for name in given:
+        for name, value in given.items():
             if name not in names:
                 wrong = f"{what} {name!r} is not in the circuit"
                 raise checks.InputError(unknown(wrong, name, names))
+            checks.number(f"{what} {name!r}", _number_of(value, cell_type), least=least)
         each = {n: _number_of(given.get(n, own.get(n, 0.0)), cell_type) for n in names}
         numbers = {n: x for n, x in each.items() if isinstance(x, (int, float))}
         found.append({n: float(x) for n, x in numbers.items() if not isinstance(x, bool)})
@@ -143,6 +145,7 @@ def write_file(
     circuit: Circuit,
     cell_type: int | None,
     initial: Mapping[str, float],
+    dilution: float | None,
     values: Mapping[str, float],
 ) -> None:
     """Write a circuit's equations as an SBML model; see `Circuit.to_sbml`."""
@@ -162,10 +165,14 @@ def write_file(
             f"{circuit.value_owner()} shares species of another circuit, so it is no whole model:"
             " write a circuit that has them all."
         )
+    diluted = [n for n in circuit.species if circuit.variables[n] in circuit.diluted_fields]
+    if dilution is not None:
+        graph = graph.diluted(diluted, checks.number("dilution", dilution, least=0.0))
+        diluted = []
     text = sbml.sbml_text(
         graph,
         circuit.name or label_of(part),
         *written_numbers(circuit, cell_type, initial, values),
-        [n for n in circuit.species if circuit.variables[n] not in circuit.diluted_fields],
+        [n for n in circuit.species if n not in diluted],
     )
     sbml.write(path, text)

@@ -7,6 +7,7 @@ import re
 from torchfilm.circuits import ANTIMONY_FILES, SBML_FILES
 from torchfilm.circuits.sbml.document import needed, shortened
 from torchfilm.tools.checks import InputError
+from torchfilm.tools.warn_once import warn
 
 # What a line of a model has: a reaction, a rate rule, or the beginning of a model.
 STATEMENT = re.compile(r"->|=>|^\s*\w+\s*'\s*=|^\s*\*?(model|module|species)\b", re.MULTILINE)
@@ -57,7 +58,14 @@ def to_sbml(text: str, where: str) -> str:
             line_of = ERROR.match(said)
             at = f", line {line_of[1]}" if line_of else ""
             raise InputError(f"{where}{at}: {ERROR.sub('', said)}")
-        return str(antimony.getSBMLString(antimony.getMainModuleName()))
+        main = str(antimony.getMainModuleName())
+        names = [str(antimony.getNthModuleName(k)) for k in range(antimony.getNumModules())]
+        # another model may be a part of this one: "part: other();"
+        used = [n for n in names if re.search(rf":\s*{re.escape(n)}\s*\(", plain)]
+        left = [n for n in names if n not in (main, "__main", *used)]
+        if left:
+            warn(f"{where} has several models: {main} is read, and not {', '.join(left)}.")
+        return str(antimony.getSBMLString(main))
     finally:
         antimony.clearPreviousLoads()
         antimony.freeAll()
