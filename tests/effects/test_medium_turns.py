@@ -279,7 +279,7 @@ def test_time_is_that_of_each_effect():
 
 def test_what_is_said_before_a_run():
     said = tf.explain(growing(4), seconds=0)
-    assert "4 turns of circuits and transport in a step, for ahl" in said
+    assert "4 turns of cells and transport in a step, for ahl" in said
     assert "first order in dt/4" in said
     assert "turns of circuits" not in tf.explain(growing(1), seconds=0)
     fast = resting(medium(2, 1000.0), exchanging(), FOUR)

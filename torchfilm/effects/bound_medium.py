@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchfilm.effect import BEFORE_CELLS, CIRCUIT, DIVISION, GRID_COVERAGE, Binding, BoundEffect
+from torchfilm.effect import (
+    BEFORE_CELLS,
+    CIRCUIT,
+    DIVISION,
+    GRID_COVERAGE,
+    NUTRITION,
+    Binding,
+    BoundEffect,
+)  # fmt: skip
 from torchfilm.effects.medium_transport import Transport
 from torchfilm.signals.exchange import spans
 from torchfilm.signals.space import MOST_VOXELS
@@ -99,8 +107,9 @@ class FirstHalf(_MediumPart):
         return self.transport.carried(state, dt / 2, dt / 2 / self.effect.steps)
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        whole = len(self.transport.in_turns) < len(self.effect.signals)
-        first = dt / 2 / self.effect.steps if self.transport.in_turns else dt / 2
+        often = self.transport.in_turns | self.transport.eaten_in_turns
+        whole = len(often) < len(self.effect.signals)
+        first = dt / 2 / self.effect.steps if often else dt / 2
         hours = f"{first:g} h" + (f" or {dt / 2:g} h" if whole and first < dt / 2 else "")
         return [f"over {hours}, by the methods that the main part of transport lists"]
 
@@ -110,6 +119,8 @@ class FirstHalf(_MediumPart):
 
 class BoundMedium(_MediumPart):
     """Transports signals after exchange with the cells: over the second half of a step, or all."""
+
+    eaten: frozenset[str] = frozenset()  # signals that nutrition takes
 
     def declares(self) -> list[Field]:
         first = self.transport.first
@@ -138,31 +149,37 @@ class BoundMedium(_MediumPart):
             self.transport.check(name, state)
 
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
-        circuits = [e for e in effects if e.stage == CIRCUIT]
-        if not any(e.exchanges() for e in circuits):
-            return
-        for effect in circuits:
-            effect.turns = self.effect.steps
-        # what acts once in a step before them, such as nutrition, finds its signals half way
-        once = [e for e in effects if BEFORE_CELLS < e.stage < CIRCUIT and e.place != self.place]
-        known = {name for effect in once for name in (*effect.reads(), *effect.writes())}
-        names = [n for n in self.effect.signals if OUTSIDE + n not in known]
-        self.transport.in_turns = frozenset(names)
+        others = [e for e in effects if e.place != self.place and e.stage > BEFORE_CELLS]
+        circuits = [e for e in others if e.stage == CIRCUIT]
+        eaters = [e for e in others if e.stage == NUTRITION and e.exchanges()]
+        # what acts once in a step finds its signals half way
+        known = lambda once: {n for e in once for n in (*e.reads(), *e.writes())}
+        for eater in eaters:
+            self.eaten |= {*eater.exchanges()}
+            rest = known([e for e in others if e is not eater and e.stage <= CIRCUIT])
+            names = frozenset(n for n in eater.exchanges() if OUTSIDE + n not in rest)
+            if len(names) == len(eater.exchanges()):
+                eater.turns, self.transport.eaten_in_turns = self.effect.steps, names
+        if any(e.exchanges() for e in circuits):
+            for effect in circuits:
+                effect.turns = self.effect.steps
+            once = known([e for e in others if e.stage < CIRCUIT])
+            names = frozenset(n for n in self.effect.signals if OUTSIDE + n not in once)
+            self.transport.in_turns = names
 
     def step(self, state: State, dt: float) -> State:
-        return self.turn(state, dt, 0, 1)
+        """Transport to the end of the step."""
+        part = (0.5 if self.effect.halves else 1.0) * dt
+        return self.transport.carried(state, part, part / self.effect.steps)
 
-    def turn(self, state: State, dt: float, done: int, number: int) -> State:
-        """The state after the next of a `number` of turns with cells, of which so many are `done`:
-        transport up to the middle of the next turn of the cells, or to the end of the step."""
-        halves = self.effect.halves
-        if done < number - 1:
-            return self.transport.carried(state, None, dt / number, 2 if halves else 1)
-        part = 0.5 if halves else 1.0
-        return self.transport.carried(state, part * dt, part * dt / number)
+    def between(self, state: State, dt: float, names: frozenset[str]) -> State:
+        """The state after transport of some signals between two turns of cells in a step."""
+        part = dt / self.effect.steps
+        return self.transport.carried(state, dt, part, 2 if self.effect.halves else 1, names)
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        return self.effect.numerics(dt, state, self.transport.in_turns)
+        often = self.transport.in_turns | self.transport.eaten_in_turns
+        return self.effect.numerics(dt, state, often, self.eaten)
 
 
 class GridCoverage(_MediumPart):

@@ -57,8 +57,9 @@ class Transport:
                 else None
             ),
         }
-        # the signals that take turns with circuits, in the medium's steps
+        # signals that take turns with cells, in the medium's steps: with circuits, with nutrition
         self.in_turns: frozenset[str] = frozenset()
+        self.eaten_in_turns: frozenset[str] = frozenset()
         self._of_step: dict[Any, Carrier] | None = None
         # weak keys: a grid no longer in use releases its steps
         self.carriers: WeakKeyDictionary[Grid, dict[Any, Carrier]] = WeakKeyDictionary()
@@ -92,19 +93,22 @@ class Transport:
         return _on_grid(self.signals[name], name, what, state)
 
     def carried(
-        self, state: State, hours: float | None, turn: float | None, pieces: int = 1
+        self,
+        state: State,
+        hours: float,
+        turn: float,
+        pieces: int = 1,
+        names: frozenset[str] | None = None,
     ) -> State:
         """The state after transport, in which cells do not change: of the signals that take turns
-        with circuits for `turn` hours, in so many pieces where the method is not exact; of the
-        others for so many `hours`, in the medium's steps. None: not at all."""
+        with cells for `turn` hours, in so many pieces where the method is not exact; of the others
+        for so many `hours`, in the medium's steps. names: of the signals to move; None: all."""
         assert state.layout is not None
         grid, steps = state.layout.grid, self.medium.steps
         changed = {}
-        for name in self.signals:
-            often = name in self.in_turns
+        for name in self.signals if names is None else sorted(names):
+            often = name in self.in_turns or name in self.eaten_in_turns
             whole, count = (turn, pieces) if often else (hours, steps)
-            if whole is None:
-                continue
             count = 1 if often and self.medium.method_of(name)[0] in EXACT else count
             part = whole / count
             values = state.fields[OUTSIDE + name]

@@ -4,6 +4,7 @@ dense colonies starve in the middle (Monod 1949)."""
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,30 +18,82 @@ from torchfilm.circuits import run
 from torchfilm.circuits.compiled_stiff import CompiledStiff, compiled_stiff
 from torchfilm.circuits.names import Names
 from torchfilm.circuits.tracing import Untraceable
-from torchfilm.effect import NUTRITION, Binding, BoundEffect, Effect
+from torchfilm.effect import NUTRITION, Binding, BoundEffect, Concern, Effect
 from torchfilm.medium_exchange import MediumExchange
 from torchfilm.resolver import Values
 from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import why_torch
 from torchfilm.tools.doubling import check_doubling
+from torchfilm.tools.ragged import Groups
+from torchfilm.tools.threads import one_torch_thread
 from torchfilm.values import CONCENTRATION, Value, is_drawn, numbers, physical
 
 CONSTANTS = ("rate", "half", "growth_yield")
 STIFF = run.IntegrationSettings("rosenbrock", 1, 1e-4, 1e-9, 1.0)
 
 
+# Of the turnover of pools: from which it is a concern, and what is fine. It is looked at in every
+# eighth step, and lasts if five looks in a row find it.
+TURNOVER, FINE = 0.65, 0.1
+LOOK, LASTING = 8, 5
+
+
 @dataclass(frozen=True)
 class NutritionReport:
     """`status` (B,): 1 if the integration of a cell's uptake failed. `uptake` (B,): amount taken up
-    in this step, conc·µm³."""
+    in this step, conc·µm³. taken, of_pool (N,): what each cell took in the last turn with
+    transport, and how often it would have emptied its pool at the rate at which it began. groups:
+    of the cells by colony. step: its number."""
 
     status: Tensor
     uptake: Tensor
+    taken: Tensor
+    of_pool: Tensor
+    groups: Groups
+    step: int
     hint = "A smaller dt may help"
 
     def reason(self, place: int) -> str:
         return "the integration of a cell's uptake failed"
+
+    def after(self, earlier: NutritionReport) -> NutritionReport:
+        """With what failed, and what was taken up, earlier in the same step."""
+        status = torch.maximum(earlier.status, self.status)
+        return dataclasses.replace(self, status=status, uptake=earlier.uptake + self.uptake)
+
+    @property
+    def turnover(self) -> Tensor:
+        """How often cells would empty their pools in a turn, (B,): a mean, weighted by what each
+        takes. A pool is refilled only between turns, so that with a turnover of x uptake is too low
+        by a factor of up to (1 − exp(−x))/x."""
+        taken = self.taken.double()
+        sums = self.groups.sum(torch.stack([self.of_pool.double() * taken, taken], 1))
+        return sums[:, 0] / sums[:, 1].clamp(min=1e-300)
+
+    def concerns(self) -> list[Concern]:
+        """Colonies that are fed too little for long, since transport lags behind uptake."""
+        if self.step % LOOK or not len(self.taken):
+            return []
+        with one_torch_thread():  # a sum over few numbers
+            turnover = self.turnover
+        return [Concern("turnover", turnover > TURNOVER, LASTING, partial(_of_turnover, turnover))]
+
+
+def _too_low(turnover: float) -> float:
+    """By which part uptake may be too low."""
+    return 1.0 + math.expm1(-turnover) / turnover
+
+
+def _of_turnover(turnover: Tensor, ids: Tensor, where: Tensor) -> str:
+    worst = float(turnover[where].max())
+    return (
+        f"colony {', '.join(map(str, ids[where].tolist()[:5]))}: nutrition takes {worst:.2g} times"
+        " what the medium at the cells holds, and transport refills it only afterwards: growth may"
+        f" be up to {_too_low(worst):.0%} too low. With {math.ceil(worst / FINE)} times as many"
+        " Medium(steps=…), or a dt smaller by as much, it is at most"
+        f" {_too_low(FINE):.0%}."
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +142,7 @@ class Monod(Effect):
         return ("growth_rate", OUTSIDE + self.signal, f"{self.signal}_eaten")
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
-        return (_BoundMonod(self, binding),)
+        return (BoundMonod(self, binding),)
 
     def check_step(self, dt: float, divides: bool) -> None:
         if divides:
@@ -110,7 +163,7 @@ class Monod(Effect):
             )
 
 
-class _BoundMonod(BoundEffect):
+class BoundMonod(BoundEffect):
     """Monod bound to a batch; it also reads and writes the reservoir's field, if there is one."""
 
     effect: Monod
@@ -138,21 +191,50 @@ class _BoundMonod(BoundEffect):
         return [
             "each cell by the stiff solver, with its default tolerances; the medium loses what"
             " cells take up, to rounding",
+            *self._cost_of_turns(dt, state),
             f"computed by torch: {self.by_torch}"
             if self.by_torch
             else "computed by compiled functions; by torch where gradients are required",
         ]
 
+    def _cost_of_turns(self, dt: float, state: State) -> list[str]:
+        """What it costs the first cells that uptake and transport take turns. A line, or none."""
+        medium = MediumExchange.of(state, (self.effect.signal,))
+        if not state.cells or medium is None:
+            return []
+        medium.find()
+        constants = {n: self.values[n].of_cells(state) for n in CONSTANTS}
+        most = float(self._of_pool(state.volume, medium, constants, dt / self.turns).max())
+        if most <= FINE:
+            return []
+        return [
+            f"in a turn with transport a cell takes up to {most:.2g} times what the medium at it"
+            f" holds: where diffusion would refill it, growth is up to {_too_low(most):.0%} too"
+            f" low; at most {_too_low(FINE):.0%} with {math.ceil(most / FINE)} times as many"
+            " Medium(steps=…)"
+        ]
+
+    def exchanges(self) -> tuple[str, ...]:
+        return (self.effect.signal,)
+
     def step(self, state: State, dt: float) -> State:
+        return self.turn(state, dt, 0, 1)
+
+    def turn(self, state: State, dt: float, done: int, number: int) -> State:
+        """The state after dt hours of uptake, one of a `number` of turns with transport in a step
+        of the scene, of which so many are `done`. Cells grow by it after the last."""
         signal = self.effect.signal
         medium = MediumExchange.of(state, (signal,))
         if state.cells == 0 or medium is None:
             return state
         medium.find()
-        volume, there, in_reservoir = state.volume, medium.found[signal], medium.in_reservoir
+        there, in_reservoir = medium.found[signal], medium.in_reservoir
+        # with what it will grow by the turns that are done
+        earlier = state.growth_rate if done else torch.zeros_like(state.growth_rate)
+        volume = state.volume * torch.exp(earlier * (dt * number)) if done else state.volume
         constants = {n: self.values[n].of_cells(state) for n in CONSTANTS}
         greatest, half, gain = constants.values()
-        eaten, failed = self._eaten(state, medium, constants, dt)
+        eaten, failed = self._eaten(state, volume, medium, constants, dt)
         to_reservoir, inside = None, eaten
         if in_reservoir is not None:  # the concentration of a reservoir is constant
             there_for_good = volume / gain * torch.expm1(greatest * there / (half + there) * dt)
@@ -160,32 +242,52 @@ class _BoundMonod(BoundEffect):
             inside = torch.where(in_reservoir, 0.0, eaten)
             to_reservoir = inside - eaten
         # dV/dt = growth · V over the step, from V to V + gain · eaten
-        growth = torch.log1p(gain * eaten / volume) / dt
+        growth = earlier + torch.log1p(gain * eaten / volume) / (dt * number)
         medium.give(signal, -inside, to_reservoir)
         own = f"{signal}_eaten"
+        of_pool = self._of_pool(volume, medium, constants, dt)
         state = medium.settle(growth_rate=growth, **{own: state.fields[own] + eaten})
         uptake = state.groups.sum(eaten.unsqueeze(1)).squeeze(1)
-        note = NutritionReport(state.groups.any(failed).long(), uptake)
+        note = NutritionReport(
+            state.groups.any(failed).long(), uptake, inside.detach(), of_pool, state.groups,
+            state.step,
+        )  # fmt: skip
+        note = note.after(state.reports["nutrition"]) if done else note
         return state.replace(reports={**state.reports, "nutrition": note})
 
+    @torch.no_grad()
+    def _of_pool(
+        self, volume: Tensor, medium: MediumExchange, constants: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
+        """How often each cell would empty its pool in dt, (N,)."""
+        greatest, half, gain = constants.values()
+        pool, there = medium.pool, medium.found[self.effect.signal]
+        return greatest * volume / gain / (half + there) * dt / pool
+
     def _eaten(
-        self, state: State, medium: MediumExchange, constants: Mapping[str, Tensor], dt: float
+        self,
+        state: State,
+        volume: Tensor,
+        medium: MediumExchange,
+        constants: Mapping[str, Tensor],
+        dt: float,
     ) -> tuple[Tensor, Tensor]:
         """What each cell takes from its pool, (N,) conc·µm³, and whether its integration failed.
+        volume: (N,) µm³, as uptake begins.
 
         What is eaten is a variable beside the concentration in the pool: where nutrient abounds, it
         would be lost in the rounding of a difference."""
         signal = self.effect.signal
         cells = run.CircuitCells(
             partial(_uptake, signal), ("eaten",), (signal,),
-            torch.arange(state.cells, device=state.device), {"volume": state.volume}, constants,
+            torch.arange(state.cells, device=state.device), {"volume": volume}, constants,
             medium.found, medium.pool, label=f"uptake of {signal}",
         )  # fmt: skip
         if self.compiled is None:
             with suppress(Untraceable):  # a gradient is wanted: torch finds the slopes, too
                 self.compiled = compiled_stiff(cells)
         cells = dataclasses.replace(cells, compiled=self.compiled, by_torch=bool(self.by_torch))
-        found = run.step(cells, torch.zeros_like(state.volume).unsqueeze(1), dt, STIFF)
+        found = run.step(cells, torch.zeros_like(volume).unsqueeze(1), dt, STIFF)
         return found.concentrations[:, 0], found.failed
 
 
