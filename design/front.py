@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -108,7 +108,8 @@ class Front:
         first = self[0].colonies()
         last = self[len(self) - 1].colonies() if len(self) > 1 else []
         lines.append(f"cells: {cells_in(first + last)}")
-        for title, part in zip(self.titles, task.target.parts, strict=True):
+        goals: Any = task.target
+        for title, part in zip(self.titles, goals.parts, strict=True):
             compared = part.names and part.pattern and not part.bounds and not of_seeds(part)
             if compared and (found := trivial_losses(part, first, task.reduced)):
                 each = ", ".join(f"{name} {loss:.3f}" for name, loss in found.items())

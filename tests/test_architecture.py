@@ -46,6 +46,7 @@ ROOMS = {
             "torchfilm.parameters",
             "torchfilm.effect",
             "torchfilm.medium_exchange",
+            "torchfilm.rule_values",
             "torchfilm.rule_views",
         ),
     ),

@@ -11,6 +11,7 @@ import pytest
 from commands import OWN, frames, shell
 
 import torchfilm as tf
+from torchfilm.cli.scene_files import parse_settings
 
 # --- errors ---------------------------------------------------------------------------------------
 
@@ -221,6 +222,24 @@ def test_resume_with_a_field_of_another_shape_is_reported(command):
     Path("mine.py").write_text(rules.format("position * 2"))
     with pytest.raises(SystemExit, match=r"of another shape there: 'mark'"):
         command("resume", "mine.h5", "--scene", "mine.py", "--until", 2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--set", "rate=1", "rate=2"), r"--set = 'rate=2'.*the only value of 'rate'"),
+        (("--set", "rate=1", "--set", "rate=2"), r"--set = 'rate=2'.*the only value of 'rate'"),
+        (("--until", 1, "--until", 2), "the option --until is given twice"),
+    ],
+)
+def test_what_is_given_twice_is_refused(command, arguments, said):
+    with pytest.raises(SystemExit, match=said):
+        command("run", "microcolony", *arguments)
+
+
+@pytest.mark.parametrize(("text", "value"), [("false", False), ("TRUE", True), ("False", False)])
+def test_conditions_may_be_written_in_any_case(text, value):
+    assert parse_settings([f"open_ended={text}"]) == {"open_ended": value}
 
 
 # --- notes on the cells to start from -------------------------------------------------------------

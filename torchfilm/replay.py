@@ -29,6 +29,7 @@ from torchfilm.tools.hot_reload import unchanged
 from torchfilm.tools.ragged import expand_ranges, offsets
 from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.warn_once import once
+from torchfilm.turns import Turns
 
 FIRST = -1  # the part of what happens before all effects
 
@@ -293,7 +294,7 @@ class Replay(metaclass=checks.KnownKeywords):
             state = self._with_failures(state, number)
         return advanced(state, self.dt)
 
-    def _follow(self, effect: BoundEffect, state: State) -> State:
+    def _follow(self, effect: BoundEffect | Turns, state: State) -> State:
         """The state after an effect that only follows. Raises TypeError where it changes what
         growth uses, and so should not have been left out of the recording."""
         after = effect.run_step(state, self.dt)

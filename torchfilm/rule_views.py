@@ -6,7 +6,6 @@ Rules may read every name, and write those that the model allows.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -14,8 +13,8 @@ from torch import Tensor
 
 from torchfilm.circuits.names import Names
 from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.rule_values import RuleError, as_tensor, broadcast_copy, check_integers, real_column
 from torchfilm.state import CELL, CELL_TYPE, COLONY, OUTSIDE, Field, State
-from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import unchanged
 
 # The paper's names (Table 1) and ours.
@@ -52,24 +51,6 @@ def _quantity(state: State, name: str) -> Tensor:
     if name in state.declared and state.declared[name].scope == COLONY:
         return state.fields[name].index_select(0, state.colony)
     return state.own_colony_id if name == "colony" else getattr(state, name)
-
-
-def _check_integers(name: str, tensor: Tensor, dtype: torch.dtype) -> None:
-    """Raises RuleError if an integer field would get non-integers."""
-    if (
-        tensor.is_floating_point()
-        and not dtype.is_floating_point
-        and dtype != torch.bool
-        and not bool((tensor == tensor.round()).all())
-    ):
-        raise RuleError(
-            f"{name} is an integer field; got non-integers. Give it a first value such as 0.0 if it"
-            " should take any number."
-        )
-
-
-class RuleError(checks.InputError, AttributeError):
-    """A rule read an unknown name, or wrote an invalid value."""
 
 
 class CellsView:
@@ -199,7 +180,7 @@ class CellsView:
             if declared is not None
             else None
         )
-        tensor = _as_tensor(f"cells.{name}", value, state.device)
+        tensor = as_tensor(f"cells.{name}", value, state.device)
         if dtype is None:
             # a Python number makes a variable of floating-point type
             plain = tensor.is_floating_point() or (
@@ -220,7 +201,7 @@ class CellsView:
         self._written.add(name)
         own = declared.shape if name in state.fields and declared else tuple(tensor.shape[1:])
         shape = (state.cells, *own)
-        self._work[name] = _broadcast_copy(f"cells.{name}", tensor.to(state.device), dtype, shape)
+        self._work[name] = broadcast_copy(f"cells.{name}", tensor.to(state.device), dtype, shape)
 
     def __iter__(self):
         return (CellView(self, k) for k in range(self._state.cells))
@@ -238,19 +219,18 @@ class CellsView:
 
     def colony_max(self, value: Tensor) -> Tensor:
         """The greatest value in each cell's own colony, (N,) -> (N,)."""
+        value = real_column("colony_max", value, self._state)
         return self._state.groups.max(value).index_select(0, self._state.colony)
 
     def colony_min(self, value: Tensor) -> Tensor:
         """The smallest value in each cell's own colony, (N,) -> (N,)."""
-        return -self.colony_max(-value)
+        return -self.colony_max(-real_column("colony_min", value, self._state))
 
     def colony_sum(self, value: Tensor) -> Tensor:
-        """The sum over each cell's own colony, (N,) -> (N,)."""
-        return (
-            self._state.groups.sum(value.unsqueeze(1))
-            .squeeze(1)
-            .index_select(0, self._state.colony)
-        )
+        """The sum over each cell's own colony, (N,) -> (N,); of a condition, how many fulfil it."""
+        value = real_column("colony_sum", value, self._state)
+        total = self._state.groups.sum(value.unsqueeze(1)).squeeze(1)
+        return total.index_select(0, self._state.colony)
 
     def contacts(self, within: float = 0.05) -> tuple[Tensor, Tensor]:
         """Pairs of cells whose surfaces are at most `within` µm apart: two (P,) index tensors.
@@ -309,7 +289,7 @@ class CellView:
             or name in cells._work
         ):
             column = getattr(cells, name)
-            _check_integers(f"cell.{name}", torch.as_tensor(value), column.dtype)
+            check_integers(f"cell.{name}", torch.as_tensor(value), column.dtype)
             column[self._index] = value
             cells._written.add(name)
         elif cells._declaring:
@@ -405,8 +385,8 @@ class DivisionView:
                 f" have {own}"
             )
         like = getattr(self, name)
-        tensor = _as_tensor(f"{self._name}.{name}", value, like.device)
-        self._work[name] = _broadcast_copy(f"{self._name}.{name}", tensor, like.dtype, like.shape)
+        tensor = as_tensor(f"{self._name}.{name}", value, like.device)
+        self._work[name] = broadcast_copy(f"{self._name}.{name}", tensor, like.dtype, like.shape)
         self._set.add(name)
 
     def random(self) -> Tensor:
@@ -418,23 +398,3 @@ class DivisionView:
             else torch.arange(self._state.cells, device=self._state.device)
         )
         return self._state.uniform(rows, f"{self._purpose} {self._draws}")
-
-
-def _as_tensor(name: str, value: Any, device: torch.device) -> Tensor:
-    """The value as a tensor, or RuleError."""
-    try:
-        return value if isinstance(value, Tensor) else torch.as_tensor(value, device=device)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise RuleError(f"{name} was set to {value!r}: it must be a number or a tensor.") from error
-
-
-def _broadcast_copy(name: str, tensor: Tensor, dtype: torch.dtype, shape: Sequence[int]) -> Tensor:
-    """A copy with the given type and shape. Raises RuleError if it does not fit."""
-    _check_integers(name, tensor, dtype)
-    try:
-        return tensor.to(dtype).broadcast_to(shape).clone()
-    except RuntimeError as error:
-        raise RuleError(
-            f"{name} was set to a tensor of shape {tuple(tensor.shape)}: it must be one value or"
-            f" {tuple(shape)}."
-        ) from error

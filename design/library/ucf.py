@@ -137,7 +137,7 @@ class Records:
         there[name] = Record(data, what)
 
 
-def _read(data: dict[str, Any]) -> dict[str, Any]:
+def _read(data: Mapping[str, Any]) -> dict[str, Any]:
     """What is read of a record: variables of functions are only listed."""
     return {key: value for key, value in data.items() if key != "variables"}
 

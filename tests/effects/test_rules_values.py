@@ -284,3 +284,44 @@ def test_errors_without_words_and_in_what_a_rule_calls():
     with pytest.raises((tf.InputError, RuntimeError)) as caught:
         growing(tf.Growth(), tf.Rules(wrong)).bind()
     assert "ragged.py" not in str(caught.value)
+
+
+@pytest.mark.parametrize("number", [0.02, -1.0, math.nan])
+@pytest.mark.parametrize("flag", ["remove_flag", "divide_flag"])
+def test_a_flag_is_true_or_false_and_no_probability(flag, number):
+    """Any number but 0 would count as True, for all cells."""
+
+    def update(cells):
+        setattr(cells, flag, number)
+
+    def one_by_one(cells):
+        for cell in cells:
+            setattr(cell, flag, number)
+
+    for rule in (update, one_by_one):
+        scene = growing(tf.Rules(rule), tf.Division(length=4.0))
+        with pytest.raises(tf.InputError, match=rf"{flag} is True or False.*cells\.random\(\)"):
+            scene.bind().start()
+
+
+def test_a_colony_counts_the_cells_of_a_condition():
+    seen = {}
+
+    def update(cells):
+        seen["lit"] = cells.colony_sum(cells.cell_type == 1)
+        seen["types"] = cells.colony_sum(cells.cell_type)
+        seen["all"] = cells.colony_sum(1)
+        seen["any"] = cells.colony_max(cells.cell_type == 1)
+
+    cells = tf.Cells(
+        [[0.0, 0.0], [5.0, 0.0], [9.0, 0.0]], [[1.0, 0.0]] * 3, cell_type=[1, 1, 0],
+        colony=[0, 0, 1],
+    )  # fmt: skip
+    scene = tf.Scene(tf.Rules(update), founders=cells)
+    step(scene, scene.bind().start(), 0.1)
+    assert {n: x.tolist() for n, x in seen.items()} == {
+        "lit": [2, 2, 0], "types": [2, 2, 0], "all": [2, 2, 1], "any": [1, 1, 0],
+    }  # fmt: skip
+    wrong = tf.Scene(tf.Rules(lambda cells: cells.colony_sum(cells.position)), founders=cells)
+    with pytest.raises(tf.InputError, match=r"colony_sum was given a tensor of shape .*\(\d+,\)"):
+        wrong.bind().start()

@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 from torchfilm.cli.model_files import is_model
-from torchfilm.cli.scene_files import load_scene, parse_setting
+from torchfilm.cli.scene_files import load_scene, parse_settings
 from torchfilm.cli.show import check_new_picture
 from torchfilm.cli.threads import use_threads
 from torchfilm.explanation import explain
@@ -38,7 +38,7 @@ class Info:
         is_scene = path.suffix in (".py", ".json") or is_model(path)
         if path.suffix in (".h5", ".hdf5") or (path.is_file() and not is_scene):
             return self._of_results()
-        scene = load_scene(self.what, dict(map(parse_setting, self.set)))
+        scene = load_scene(self.what, parse_settings(self.set))
         # binding tries the rules and circuits, which shows what they read and write
         print(scene.bind(per_colony=True).describe())
 
@@ -100,7 +100,7 @@ class Explain:
 
     def __call__(self) -> None:
         scene = accurate(
-            load_scene(self.scene, dict(map(parse_setting, self.set))), self.preset, self.settings
+            load_scene(self.scene, parse_settings(self.set)), self.preset, self.settings
         )
         use_threads(self.threads, max(scene.fixed_colonies, self.colonies or 1))
         print(
@@ -152,7 +152,7 @@ class Tune:
             Settings.check_new(self.out)
         if self.plot is not None:
             check_new_picture("--plot", self.plot)
-        scene = load_scene(self.scene, dict(map(parse_setting, self.set)))
+        scene = load_scene(self.scene, parse_settings(self.set))
         use_threads(self.threads)  # tune itself chooses the number of colonies
         with _status_line() as watch:
             tuned = tune(

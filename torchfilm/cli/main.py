@@ -92,8 +92,12 @@ def check_options(args: list[str]) -> None:
     fields = [f for f in _options(command) if "Positional" not in str(f.type)]
     known = {f"--{f.name.replace('_', '-')}": str(f.type) for f in fields}
     off = {f"--no-{name[2:]}" for name, kind in known.items() if kind == "bool"}
+    seen = set()
     for arg in args[1:]:
         name = arg.partition("=")[0].replace("_", "-")
+        if name in seen and not known[name].startswith("list"):
+            raise InputError(f"the option {name} is given twice: keep one.")
+        seen |= {name} & {*known}
         if arg.startswith("--") and name not in (*known, *off, "--help"):
             raise unknown_keyword(args[0], arg.partition("=")[0], list(known))
 

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from torchfilm import pictures, scenes
 from torchfilm.cellmodeller import own_colour
 from torchfilm.cli.report import summary_table
-from torchfilm.cli.scene_files import design, load_scene, parse_setting
+from torchfilm.cli.scene_files import design, load_scene, parse_settings
 from torchfilm.cli.show import check_new, own_picture
 from torchfilm.cli.start_cells import Options, StartCells
 from torchfilm.cli.threads import use_threads
@@ -89,7 +89,7 @@ class Run:
 
     def __call__(self) -> None:
         scene = accurate(
-            load_scene(self.scene, dict(map(parse_setting, self.set))), self.preset, self.settings
+            load_scene(self.scene, parse_settings(self.set)), self.preset, self.settings
         )
         plan = design(self.scene)
         cells, until = self.cells, self.until

@@ -7,7 +7,7 @@ import inspect
 import json
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -161,6 +161,17 @@ def design(what: str) -> dict[str, Any]:
                 f"{name} in {what}", value, allowed, "Leave it out for the default."
             )
     return content
+
+
+def parse_settings(texts: Sequence[str]) -> dict[str, Any]:
+    """Parameters by name, from NAME=VALUE each. Raises InputError for a name given twice."""
+    found: dict[str, Any] = {}
+    for text in texts:
+        name, value = parse_setting(text)
+        if name in found:
+            raise checks.input_error("--set", text, f"the only value of {name!r}, given twice")
+        found[name] = value
+    return found
 
 
 def parse_setting(text: str) -> tuple[str, Any]:

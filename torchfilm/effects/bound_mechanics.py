@@ -62,7 +62,9 @@ class BoundMechanics(BoundEffect):
     def _check_precision(self) -> None:
         """Raise InputError for forces that are wanted more exactly than the states' numbers are."""
         wanted, dtype = self.settings.tolerance, self.binding.batch.dtype
-        if isinstance(self.settings, OneSidedSettings) and wanted < FINEST * torch.finfo(dtype).eps:
+        if not isinstance(self.settings, OneSidedSettings) or wanted is None:
+            return
+        if wanted < FINEST * torch.finfo(dtype).eps:
             raise checks.input_error(
                 "Mechanics.tolerance",
                 wanted,

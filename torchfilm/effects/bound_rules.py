@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import Binding, BoundEffect
-from torchfilm.rule_views import KNOWN_FIELDS, MEANS, CellsView, DivisionView, RuleError
+from torchfilm.rule_values import RuleError
+from torchfilm.rule_views import KNOWN_FIELDS, MEANS, CellsView, DivisionView
 from torchfilm.state import Births, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import HotReload

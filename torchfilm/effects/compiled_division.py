@@ -71,7 +71,8 @@ def due_rows(state: State, size: Tensor | None) -> tuple[Tensor | None, int]:
     see `kernels.divisions.due_rows`. size: (N,), or None where there is no threshold."""
     from torchfilm.kernels import divisions
 
-    fields, none = state.fields, np.empty(0, in_numpy(state.dtype))
+    fields = state.fields
+    none: np.ndarray = np.empty(0, in_numpy(state.dtype))
     real = lambda x: as_array(x, state.dtype)
     criterion = (none, none) if size is None else (real(size), real(fields["division_threshold"]))
     flag = as_array(fields["divide_flag"], torch.bool)

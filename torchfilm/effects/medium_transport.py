@@ -132,10 +132,10 @@ class Transport:
         key = (name, batch.shape, dt, state.dtype, torch.is_grad_enabled())
         found = known.get(key)
         if found is None:
-            found, own = self._prepare(name, state, batch, dt)
+            found, differentiable = self._prepare(name, state, batch, dt)
             # a function may use a tensor that requires a gradient; such a step serves one
             # backward pass only, so it is not kept
-            if not own:
+            if not differentiable:
                 known[key] = found
         return found
 

@@ -40,7 +40,7 @@ class Rules(Effect):
     variables: Mapping[str, float] = field(default_factory=dict)
     path: Path | None = field(init=False, repr=False)
     functions: dict[str, Any] = field(init=False, repr=False)
-    stamp: int = field(init=False, repr=False)  # of the file as it was loaded, ns
+    stamp: tuple[int, int] = field(init=False, repr=False)  # of the file as it was loaded
 
     stage = RULES
     title = "rules"

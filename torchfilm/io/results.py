@@ -202,13 +202,14 @@ class Results(metaclass=checks.KnownKeywords):
         have, such as species; by default all but those that serve the numerics. Raises InputError
         for other names."""
         found = self.frame(frame)
-        own = {n: found.pop(n) for n in ("position", "axis", "length", "radius", "colony")}
-        own["cell_type"] = found.pop("cell_type", None)
-        serving = {*self.internal_fields, "uid", "parent"}
+        own = ("position", "axis", "length", "radius", "colony", "cell_type")
+        serving = {*self.internal_fields, "uid", "parent", *own}
         known = {n: v for n, v in found.items() if n not in serving and v.ndim == 1}
         for name in known if fields is None else fields:
             checks.choice("fields", name, tuple(known))
-        return Cells(**own, extra={n: known[n] for n in (known if fields is None else fields)})
+        extra = {n: known[n] for n in (known if fields is None else fields)}
+        columns: dict[str, Any] = {n: found.get(n) for n in own}
+        return Cells(**columns, extra=extra)
 
     def colony_fields(self, frame: int = -1) -> dict[str, np.ndarray]:
         """The fields per colony of one frame by name, each (B, …)."""

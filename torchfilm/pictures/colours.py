@@ -284,8 +284,8 @@ def scale_of(
 def _wide_enough(low: float, high: float, share: float) -> tuple[float, float]:
     """The range, or one of this share of the largest value around values that differ less: the
     errors of solvers are no pattern."""
-    if low == high:
-        return low, low + (abs(low) or 1.0)
+    if low == high:  # in the middle of the range, since it is neither low nor high
+        return (low - 0.5 * abs(low), low + 0.5 * abs(low)) if low else (0.0, 1.0)
     least = share * max(abs(low), abs(high))
     if high - low >= least:
         return low, high

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -213,7 +213,7 @@ def add_walls(ax: Axes, walls: Sequence[Mapping[str, Any]], colony: int, view: s
     own = lambda x: x[colony] if isinstance(x, list) else x
     seen = VIEWS[view]
     style: Any = {"color": WALL, "linewidth": 0.8, "zorder": 0.5, "gid": WALL}
-    dashes = lambda wall: "--" if wall["soft"] else "-"
+    dashes: Callable[[Any], Any] = lambda wall: "--" if wall["soft"] else "-"
     flat = []
     for wall in walls:
         if "radius" in wall:

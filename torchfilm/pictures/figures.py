@@ -256,9 +256,12 @@ def choose_colonies(
             " (frame=…, --frame)."
         )
     if colonies is None:
-        return alive[:most], (
-            f" (first {most} of {len(alive)} colonies)" if len(alive) > most else ""
-        )
+        notes = [f"first {most} of {len(alive)} colonies"] if len(alive) > most else []
+        gone = [str(int(ids[p])) for p in np.flatnonzero(~present)]
+        if gone:
+            which = f"colony {gone[0]} has" if len(gone) == 1 else f"{len(gone)} colonies have"
+            notes.append(f"{which} no cells")
+        return alive[:most], f" ({', '.join(notes)})" if notes else ""
     places = {int(ids[p]): p for p in alive}
     wrong = [c for c in colonies if c not in places]
     if wrong or not colonies:

@@ -51,8 +51,11 @@ def _given_value(value: Any) -> Any:
 
 
 def parse_value(text: str) -> Any:
-    """A parameter as typed on the command line: a Python literal, `PerColony([…])`, or a
-    distribution such as `LogNormal(1.0, 0.2)`; anything else is text."""
+    """A parameter as typed on the command line: a Python literal, also true and false in
+    any case, `PerColony([…])`, or a distribution such as `LogNormal(1.0, 0.2)`; anything else is
+    text."""
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
     try:
         return ast.literal_eval(text)
     except (ValueError, SyntaxError):

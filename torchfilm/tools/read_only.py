@@ -14,4 +14,4 @@ def read_only(given: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 # Python itself does not pickle such views
-copyreg.pickle(MappingProxyType, lambda view: (read_only, (dict(view),)))
+copyreg.pickle(MappingProxyType, lambda view: (read_only, (dict(view),)))  # type: ignore
