@@ -72,7 +72,9 @@ def known_designs(given: Start, task: Task) -> KnownDesigns:
         path = Path(given)
         if not path.is_file():
             raise checks.input_error("start", str(given), "a file that exists")
-        given = read_design(path)["parameters"] if path.suffix == ".json" else Study.read(path)
+        given = (
+            read_design(path)["parameters"] if path.suffix.lower() == ".json" else Study.read(path)
+        )
     if isinstance(given, Study):
         return _of_study(given, task)
     designs = given if isinstance(given, Sequence) else [given]

@@ -338,11 +338,11 @@ def test_a_frame_of_results_gives_cells(tmp_path):
     )
     *_, state = tf.simulate(grown.bind(2), cells=5, record=tmp_path / "run.h5")
     with tf.Results(tmp_path / "run.h5") as results:
-        cells, some = results.cells(), results.cells(0, fields=["gfp"])
+        cells, some = results.cells(), results.cells(0, fields=["growth_rate"])
         with pytest.raises(tf.InputError, match=r"fields = 'gpf'.*gfp"):
             results.cells(fields=["gpf"])
-    assert set(cells.extra) == {"gfp", "division_threshold", "growth_rate"}
-    assert set(some.extra) == {"gfp"}
+    assert set(cells.extra) == {"gfp"}
+    assert set(some.extra) == {"growth_rate"}
     again = grown.bind(cells=cells).start()
     for name in ("colony", "position", "axis", "length", "radius"):
         assert torch.allclose(getattr(again, name), getattr(state, name)), name

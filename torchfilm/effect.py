@@ -244,7 +244,7 @@ class BoundEffect:
         self.effect, self.binding = effect, binding
         self.title, self.stage = effect.title, effect.stage
         self.place = 0  # of the effect in its scene
-        self.turns = 1  # of exchange with the medium in a step
+        self.turns, self.takes_turns = 1, True  # of exchange with the medium; whether it can
         self.values = Values(self._resolve(effect, binding.batch))
 
     @staticmethod

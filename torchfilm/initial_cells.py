@@ -374,7 +374,7 @@ class Cells(metaclass=checks.KnownKeywords):
 
 
 # numbers of colonies up to it may leave any out
-MANY = 1000
+MANY = 100_000
 
 
 def _check_colonies(colony: np.ndarray) -> None:

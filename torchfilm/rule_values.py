@@ -18,7 +18,7 @@ class RuleError(checks.InputError, AttributeError):
 
 def check_integers(name: str, tensor: Tensor, dtype: torch.dtype) -> None:
     """Raises RuleError if a field of integers or flags would get other numbers."""
-    if not tensor.is_floating_point() or dtype.is_floating_point:
+    if tensor.dtype == torch.bool or dtype.is_floating_point:
         return
     if dtype == torch.bool:
         odd = tensor[(tensor != 0) & (tensor != 1)]
@@ -27,7 +27,7 @@ def check_integers(name: str, tensor: Tensor, dtype: torch.dtype) -> None:
                 f"{name} is True or False for each cell; got {float(odd.reshape(-1)[0]):g}. For a"
                 " probability write cells.random() < 0.02."
             )
-    elif not bool((tensor == tensor.round()).all()):
+    elif tensor.is_floating_point() and not bool((tensor == tensor.round()).all()):
         raise RuleError(
             f"{name} is an integer field; got non-integers. Give it a first value such as 0.0 if it"
             " should take any number."
@@ -35,11 +35,11 @@ def check_integers(name: str, tensor: Tensor, dtype: torch.dtype) -> None:
 
 
 def real_column(what: str, value: Any, state: State) -> Tensor:
-    """A column of real numbers (N,): conditions and integers count as numbers, and one number is
-    that of all cells."""
+    """A column of real numbers (N,): conditions and integers count as numbers, integers in float64,
+    and one number is that of all cells."""
     column = as_tensor(what, value, state.device)
     if not column.is_floating_point():
-        column = column.to(state.dtype)
+        column = column.to(state.dtype if column.dtype == torch.bool else torch.float64)
     if column.shape not in ((), (state.cells,)):
         raise RuleError(
             f"{what} was given a tensor of shape {tuple(column.shape)}: it must be one value for"

@@ -275,7 +275,9 @@ def test_both_ways_of_running_agree():
 
 
 @pytest.mark.parametrize("method", ["rosenbrock", "direct"])
-@pytest.mark.parametrize("rate", [lambda u, s, p, cell: p.k, lambda u, s, p, cell: 2.0])
+@pytest.mark.parametrize(
+    "rate", [lambda u, s, p, cell: p.k, lambda *_: 2.0, lambda *_: np.float32(2)]
+)
 def test_the_function_of_a_reaction_may_give_one_number(rate, method):
     circuit = tf.Circuit([tf.Reaction({}, {"a": 1}, rate)], species="a", method=method, k=2.0)
     column = torch.ones(3, dtype=torch.float64)

@@ -3,6 +3,8 @@ they are too few."""
 
 from __future__ import annotations
 
+import warnings
+
 import pytest
 import torch
 from exchanging_cells import BOX, F64, advance
@@ -116,8 +118,29 @@ def test_a_circuit_that_reads_the_nutrient_finds_it_half_way():
     """Then nutrition takes no turns, and says what that costs."""
     reads = scene(4, tf.Circuit(reading, species="ahl")).bind()
     assert [e.turns for e in reads.effects if e.title == "nutrition"] == [1]
+    said = str(tf.explain(fast_reading()))
+    assert "a dt" in said and "nutrition takes one turn" in said and "as many Medium" not in said
     apart = scene(4, tf.Circuit(given, species="ahl")).bind()
     assert [e.turns for e in apart.effects if e.title == "nutrition"] == [4]
+
+
+def fast_reading() -> tf.Scene:
+    fast = tf.scenes.nutrient_limited(**FAST)
+    circuit = tf.Circuit(lambda u, s, p, cell: {"a": s.nutrient - u.a}, species="a")
+    return tf.Scene(*fast.effects, circuit, dt=fast.dt)
+
+
+def test_a_nutrient_that_is_used_up_is_no_concern():
+    """Then cells would take all that comes, but they have grown already, and nothing comes."""
+    food = tf.Signal(1e3, initial=0.1)
+    made = tf.Scene(
+        tf.Monod("food", rate=1.0, half=0.01, growth_yield=0.2), tf.Growth(),
+        tf.Medium(food=food, box=BOX, spacing=4.0), founders=FOUR,
+    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        *_, state = tf.simulate(made, until=6.0, dt=0.025)
+    assert float(state.growth_rate.max()) < 0.05
 
 
 def test_uptake_beyond_what_the_medium_holds_is_said():

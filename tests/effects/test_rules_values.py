@@ -286,7 +286,7 @@ def test_errors_without_words_and_in_what_a_rule_calls():
     assert "ragged.py" not in str(caught.value)
 
 
-@pytest.mark.parametrize("number", [0.02, -1.0, math.nan])
+@pytest.mark.parametrize("number", [0.02, -1.0, math.nan, 2])
 @pytest.mark.parametrize("flag", ["remove_flag", "divide_flag"])
 def test_a_flag_is_true_or_false_and_no_probability(flag, number):
     """Any number but 0 would count as True, for all cells."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import torch
@@ -138,7 +139,8 @@ def _rate(reaction: Reaction, u: Names, s: Names, p: Names, cell: Names) -> Any:
     Raises InputError for what is no number."""
     assert callable(reaction.rate)
     rate = reaction.rate(u, s, p, cell)
-    one = isinstance(rate, (int, float)) or (isinstance(rate, Tensor) and rate.dim() == 0)
+    rate = float(rate) if isinstance(rate, Real) else rate  # of numpy, too
+    one = isinstance(rate, float) or (isinstance(rate, Tensor) and rate.dim() == 0)
     if rate is None or isinstance(rate, (str, dict, list, tuple)):
         raise checks.InputError(
             f"the rate of the reaction {reaction} is a function that returned"

@@ -35,7 +35,7 @@ class Info:
 
     def __call__(self) -> None:
         path = Path(self.what)
-        is_scene = path.suffix in (".py", ".json") or is_model(path)
+        is_scene = path.suffix.lower() in (".py", ".json") or is_model(path)
         if path.suffix in (".h5", ".hdf5") or (path.is_file() and not is_scene):
             return self._of_results()
         scene = load_scene(self.what, parse_settings(self.set))

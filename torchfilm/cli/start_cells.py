@@ -21,6 +21,7 @@ MASKS = (".tif", ".tiff", ".png", ".npy", ".nc")
 IN_A_SHELL = (
     ("pixel_size=…", "--pixel-size"),
     ("frame=…", "--frame"),
+    ('Name it by columns={"frame": …}.', "Call the column frame."),
     ('length_unit="um"', "--length-unit um"),
     ('angle_unit="degrees" or "radians"', "--angle-unit degrees or radians"),
     ('angle_unit="degrees"', "--angle-unit degrees"),

@@ -154,12 +154,15 @@ class BoundMedium(_MediumPart):
         eaters = [e for e in others if e.stage == NUTRITION and e.exchanges()]
         # what acts once in a step finds its signals half way
         known = lambda once: {n for e in once for n in (*e.reads(), *e.writes())}
+        given = {n for e in circuits for n in e.exchanges()}
         for eater in eaters:
-            self.eaten |= {*eater.exchanges()}
+            self.eaten |= {*eater.exchanges()} - given
             rest = known([e for e in others if e is not eater and e.stage <= CIRCUIT])
             names = frozenset(n for n in eater.exchanges() if OUTSIDE + n not in rest)
             if len(names) == len(eater.exchanges()):
                 eater.turns, self.transport.eaten_in_turns = self.effect.steps, names
+            else:
+                eater.takes_turns = False
         if any(e.exchanges() for e in circuits):
             for effect in circuits:
                 effect.turns = self.effect.steps

@@ -36,6 +36,7 @@ STIFF = run.IntegrationSettings("rosenbrock", 1, 1e-4, 1e-9, 1.0)
 # Of the turnover of pools: from which it is a concern, and what is fine. It is looked at in every
 # eighth step, and lasts if five looks in a row find it.
 TURNOVER, FINE = 0.65, 0.1
+HUNGRY = 0.3  # of the greatest growth rate
 LOOK, LASTING = 8, 5
 
 
@@ -43,15 +44,18 @@ LOOK, LASTING = 8, 5
 class NutritionReport:
     """`status` (B,): 1 if the integration of a cell's uptake failed. `uptake` (B,): amount taken up
     in this step, conc·µm³. taken, of_pool (N,): what each cell took in the last turn with
-    transport, and how often it would have emptied its pool at the rate at which it began. groups:
-    of the cells by colony. step: its number."""
+    transport, and how often it would have emptied its pool at the rate at which it began. share
+    (N,): s/(half + s) as it began. groups: of the cells by colony. step: its number. takes_turns:
+    whether it would take more of them."""
 
     status: Tensor
     uptake: Tensor
     taken: Tensor
     of_pool: Tensor
+    share: Tensor
     groups: Groups
     step: int
+    takes_turns: bool = True
     hint = "A smaller dt may help"
 
     def reason(self, place: int) -> str:
@@ -67,8 +71,12 @@ class NutritionReport:
         """How often cells would empty their pools in a turn, (B,): a mean, weighted by what each
         takes. A pool is refilled only between turns, so that with a turnover of x uptake is too low
         by a factor of up to (1 − exp(−x))/x."""
+        return self._mean(self.of_pool)
+
+    def _mean(self, values: Tensor) -> Tensor:
+        """The mean over each colony, (B,), weighted by what each cell takes."""
         taken = self.taken.double()
-        sums = self.groups.sum(torch.stack([self.of_pool.double() * taken, taken], 1))
+        sums = self.groups.sum(torch.stack([values.double() * taken, taken], 1))
         return sums[:, 0] / sums[:, 1].clamp(min=1e-300)
 
     def concerns(self) -> list[Concern]:
@@ -76,8 +84,11 @@ class NutritionReport:
         if self.step % LOOK or not len(self.taken):
             return []
         with one_torch_thread():  # a sum over few numbers
-            turnover = self.turnover
-        return [Concern("turnover", turnover > TURNOVER, LASTING, partial(_of_turnover, turnover))]
+            turnover, share = self.turnover, self._mean(self.share)
+        # where nutrient is used up, growth is slow by the law itself
+        where = (turnover > TURNOVER) & (share > HUNGRY)
+        words = partial(_of_turnover, turnover, self.takes_turns)
+        return [Concern("turnover", where, LASTING, words)]
 
 
 def _too_low(turnover: float) -> float:
@@ -85,14 +96,21 @@ def _too_low(turnover: float) -> float:
     return 1.0 + math.expm1(-turnover) / turnover
 
 
-def _of_turnover(turnover: Tensor, ids: Tensor, where: Tensor) -> str:
+def _remedy(times: int, takes_turns: bool) -> str:
+    if takes_turns:
+        return f"{times} times as many Medium(steps=…), or a dt smaller by as much"
+    return (
+        f"a dt {times} times smaller (a circuit uses the nutrient, too: nutrition takes one turn)"
+    )
+
+
+def _of_turnover(turnover: Tensor, takes_turns: bool, ids: Tensor, where: Tensor) -> str:
     worst = float(turnover[where].max())
     return (
         f"colony {', '.join(map(str, ids[where].tolist()[:5]))}: nutrition takes {worst:.2g} times"
         " what the medium at the cells holds, and transport refills it only afterwards: growth may"
-        f" be up to {_too_low(worst):.0%} too low. With {math.ceil(worst / FINE)} times as many"
-        " Medium(steps=…), or a dt smaller by as much, it is at most"
-        f" {_too_low(FINE):.0%}."
+        f" be up to {_too_low(worst):.0%} too low. It is at most {_too_low(FINE):.0%} with"
+        f" {_remedy(math.ceil(worst / FINE), takes_turns)}."
     )
 
 
@@ -210,8 +228,8 @@ class BoundMonod(BoundEffect):
         return [
             f"in a turn with transport a cell takes up to {most:.2g} times what the medium at it"
             f" holds: where diffusion would refill it, growth is up to {_too_low(most):.0%} too"
-            f" low; at most {_too_low(FINE):.0%} with {math.ceil(most / FINE)} times as many"
-            " Medium(steps=…)"
+            f" low; at most {_too_low(FINE):.0%} with"
+            f" {_remedy(math.ceil(most / FINE), self.takes_turns)}"
         ]
 
     def exchanges(self) -> tuple[str, ...]:
@@ -249,8 +267,8 @@ class BoundMonod(BoundEffect):
         state = medium.settle(growth_rate=growth, **{own: state.fields[own] + eaten})
         uptake = state.groups.sum(eaten.unsqueeze(1)).squeeze(1)
         note = NutritionReport(
-            state.groups.any(failed).long(), uptake, inside.detach(), of_pool, state.groups,
-            state.step,
+            state.groups.any(failed).long(), uptake, inside.detach(), of_pool,
+            (there / (half + there)).detach(), state.groups, state.step, self.takes_turns,
         )  # fmt: skip
         note = note.after(state.reports["nutrition"]) if done else note
         return state.replace(reports={**state.reports, "nutrition": note})
@@ -262,7 +280,10 @@ class BoundMonod(BoundEffect):
         """How often each cell would empty its pool in dt, (N,)."""
         greatest, half, gain = constants.values()
         pool, there = medium.pool, medium.found[self.effect.signal]
-        return greatest * volume / gain / (half + there) * dt / pool
+        times = greatest * volume / gain / (half + there) * dt / pool
+        if medium.in_reservoir is not None:  # nothing changes it
+            times = torch.where(medium.in_reservoir, 0.0, times)
+        return times
 
     def _eaten(
         self,

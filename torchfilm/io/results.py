@@ -34,6 +34,8 @@ from torchfilm.state import State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.checks import InputError
 
+# Fields that a scene sets for its own cells, and that would overrule those of another scene.
+SET_BY_EFFECTS = ("growth_rate", "division_threshold", "birth_length")
 # Groups whose datasets grow with the run, beside frames/step.
 GROWING = (
     "cells",
@@ -199,15 +201,17 @@ class Results(metaclass=checks.KnownKeywords):
     def cells(self, frame: int = -1, *, fields: Sequence[str] | None = None) -> Cells:
         """The cells of one frame, to start another scene from; `state` goes on with the same one.
         Colonies are numbered by their places in the batch. fields: which recorded fields the cells
-        have, such as species; by default all but those that serve the numerics. Raises InputError
-        for other names."""
+        have; by default species and variables, and neither what growth and division set for each
+        cell themselves, such as `growth_rate`, nor what serves the numerics. Raises InputError for
+        other names."""
         found = self.frame(frame)
         own = ("position", "axis", "length", "radius", "colony", "cell_type")
         serving = {*self.internal_fields, "uid", "parent", *own}
         known = {n: v for n, v in found.items() if n not in serving and v.ndim == 1}
         for name in known if fields is None else fields:
             checks.choice("fields", name, tuple(known))
-        extra = {n: known[n] for n in (known if fields is None else fields)}
+        usual = [n for n in known if n not in SET_BY_EFFECTS and not n.endswith("_eaten")]
+        extra = {n: known[n] for n in (usual if fields is None else fields)}
         columns: dict[str, Any] = {n: found.get(n) for n in own}
         return Cells(**columns, extra=extra)
 
