@@ -248,14 +248,16 @@ CELLS = "x_um,y_um,angle_rad,length_um,colony\n0,0,0,2,0\n5,0,0,2,0\n0,0,0,2,2\n
 
 
 @pytest.mark.parametrize(
-    ("colonies", "empty"),
-    [([], "colony 1 of 3 stays"), (["--colonies", 5], "colonies 1, 3, 4 of 5 stay")],
+    ("colonies", "notes"),
+    [([], []), (["--colonies", 5], ["note: colonies from 3 to 4 stay empty: cells.csv has none"])],
     ids=["gaps", "more than the file has"],
 )
-def test_colonies_without_a_cell_in_the_file_are_warned_of(command, colonies, empty):
+def test_colonies_without_a_cell_in_the_file_are_warned_of(command, capsys, colonies, notes):
     Path("cells.csv").write_text(CELLS)
-    with pytest.warns(UserWarning, match=f"{empty} empty: the initial cells are of colonies 0, 2"):
+    with pytest.warns(UserWarning, match="colony 1 of 3 stays empty: the cells are of colonies 0"):
         command("run", "microcolony", "--start", "cells.csv", "--cells", 4, *colonies)
+    said = capsys.readouterr().out.splitlines()
+    assert [line for line in said if "stay empty" in line] == notes
     with tf.Results("microcolony.h5") as results:
         assert [int(n) > 0 for n in results.counts[-1]] == [True, False, True, False, False][
             : results.counts.shape[1]
@@ -263,7 +265,7 @@ def test_colonies_without_a_cell_in_the_file_are_warned_of(command, colonies, em
 
 
 def test_fewer_colonies_than_the_file_has_are_refused(command):
-    Path("cells.csv").write_text(CELLS)
+    Path("cells.csv").write_text(CELLS + "9,0,0,2,1\n")
     with pytest.raises(SystemExit, match=r"colonies = 2.*at least 3.*colony 2"):
         command("run", "microcolony", "--start", "cells.csv", "--colonies", 2)
 

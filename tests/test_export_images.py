@@ -297,7 +297,6 @@ def test_bad_input_is_named(run, tmp_path):
     masks(overwrite=True)
 
 
-@pytest.mark.filterwarnings("ignore:colon.* empty:UserWarning")
 def test_an_empty_colony_needs_a_window(tmp_path):
     cells = tf.Cells([[0.0, 0.0]], [1.0, 0.0], colony=[1])
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2), founders=cells, dt=0.1)

@@ -146,7 +146,6 @@ def dying(tmp_path) -> tf.Results:
     return recorded(scene, tmp_path / "dying.h5", 0.8, colonies=2, every=1)
 
 
-@pytest.mark.filterwarnings("ignore:colon.* empty:UserWarning")
 def test_frames_and_colonies_without_cells(tmp_path):
     results = dying(tmp_path)
     counts = results.counts.sum(1)

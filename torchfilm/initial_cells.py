@@ -149,7 +149,6 @@ class Cells(metaclass=checks.KnownKeywords):
             index = np.argsort(self.colony, kind="stable")
             colony = self.colony[index]
         counts = np.bincount(colony, minlength=colonies)
-        _warn_of_empty(counts)
         uid = np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)
 
         def tensor(values: np.ndarray, dtype: torch.dtype) -> Tensor:
@@ -249,7 +248,9 @@ class Cells(metaclass=checks.KnownKeywords):
             pixel_size, length_unit, columns, angle_unit, angle_turns, y, length_with_caps, radius,
             frame, fields, centre,
         )  # fmt: skip
-        return with_usual_widths(Cells(**table_cells(Table.read(table), reading)))
+        cells = with_usual_widths(Cells(**table_cells(Table.read(table), reading)))
+        _warn_of_empty(cells)
+        return cells
 
     @staticmethod
     @checks.known_keywords
@@ -327,7 +328,9 @@ class Cells(metaclass=checks.KnownKeywords):
         from torchfilm.micrographs.cell_tables import Reading, table_cells
 
         reading = Reading(pixel_size, length_unit, angle_unit=angle_unit)
-        return Cells(**table_cells(Table.read(columns, str(path)), reading))
+        cells = Cells(**table_cells(Table.read(columns, str(path)), reading))
+        _warn_of_empty(cells)
+        return cells
 
     def relaxed(self, depth: float = 0.01, walls: Sequence[Wall] = ()) -> Cells:
         """The same cells, pushed apart until none overlap by more than `depth` µm, and out of the
@@ -388,13 +391,16 @@ def _check_colonies(colony: np.ndarray) -> None:
         )
 
 
-def _warn_of_empty(counts: np.ndarray) -> None:
-    """Warn of colonies without a cell. counts: cells of each colony."""
+def _warn_of_empty(cells: Cells) -> None:
+    """Warn of numbers of colonies between those of a table without a cell."""
+    if cells.colony is None:
+        return
+    counts = np.bincount(cells.colony)
     empty, there = np.flatnonzero(counts == 0), np.flatnonzero(counts)
-    if empty.size and there.size:
+    if empty.size:
         warn(
             f"{_colonies(empty)} of {len(counts)} {'stays' if empty.size == 1 else 'stay'} empty:"
-            f" the initial cells are of {_colonies(there)} only. Number colonies from 0."
+            f" the cells are of {_colonies(there)} only. Number colonies from 0."
         )
 
 

@@ -395,7 +395,6 @@ def test_space_around_the_name_of_a_colony_is_no_part_of_it():
     assert Observed.from_table(table).colonies == 2
 
 
-@pytest.mark.filterwarnings("ignore:colon.* empty:UserWarning")
 def test_a_colony_without_cells(seen, tmp_path):
     """It fails where it is compared, and shows nothing where it is observed."""
     state, _ = seen
