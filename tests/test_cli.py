@@ -226,40 +226,6 @@ def test_start_from_a_file_of_cells(command, capsys, kind):
     assert re.search(r"1 pairs? .*overlap.*0\.2 µm", capsys.readouterr().out)
 
 
-def test_start_from_a_frame_of_results(command):
-    """Another scene starts from the cells of a frame, at their places, with their levels."""
-    command("run", "quorum_sensing", "--colonies", 2, "--until", 1, "--out", "a.h5", "--no-picture")
-    run = ("run", "microcolony", "--until", 0.05, "--every", 1, "--no-picture")
-    for frame, options in ((-1, ()), (1, ("--frame", 1))):
-        command(*run, "--start", "a.h5", "--out", f"b{frame}.h5", *options)
-        with tf.Results("a.h5") as old, tf.Results(f"b{frame}.h5") as new:
-            then, now = old.frame(frame), new.frame(0)
-        for name in ("colony", "position", "axis", "length", "ahl"):
-            assert np.allclose(then[name], now[name], rtol=1e-6, atol=0), name
-    for options, said in (
-        (("--frame", 99), "frame = 99.*has 5 frames"),
-        (("--pixel-size", 1), "--pixel-size.*left out: a.h5 is a results file"),
-    ):
-        with pytest.raises(SystemExit, match=said):
-            command(*run, "--start", "a.h5", "--out", "c.h5", *options)
-
-
-def test_start_from_a_label_image(command):
-    mask = np.zeros((40, 60), np.uint16)
-    mask[10:20, 5:35], mask[25:35, 20:50] = 1, 2
-    np.save("masks.npy", np.stack([0 * mask + (mask == 1), mask]))
-    run = ("run", "microcolony", "--until", 0.05, "--no-picture", "--start", "masks.npy")
-    with pytest.raises(SystemExit, match=r"--pixel-size = None.*given for masks.npy"):
-        command(*run)
-    with pytest.raises(SystemExit, match=r"2 frames.*--frame"):
-        command(*run, "--pixel-size", 0.1)
-    command(*run, "--pixel-size", 0.1, "--frame", 1, "--out", "a.h5")
-    with tf.Results("a.h5") as results:
-        first = results.frame(0)
-    assert first["position"][:, 0].tolist() == pytest.approx([1.95, 3.45])
-    assert (first["length"] + 2 * first["radius"]).tolist() == pytest.approx([3.0, 3.0], rel=0.15)
-
-
 def test_programmed_growth_and_channel_run(command):
     for name in ("programmed_growth", "channel"):
         command("run", name, "--cells", 4)
