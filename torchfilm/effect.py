@@ -18,7 +18,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import torch
 
 from torchfilm.parameters import summary
-from torchfilm.resolver import BoundBatch, Resolved, Values, drawn_field, resolve
+from torchfilm.resolver import (
+    BoundBatch,
+    DrawnValue,
+    FirstValue,
+    Resolved,
+    Values,
+    drawn_field,
+    resolve,
+)
 from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks, hashing
 from torchfilm.tools.threads import given_torch_threads, one_torch_thread
@@ -244,7 +252,7 @@ class BoundEffect:
         self.effect, self.binding = effect, binding
         self.title, self.stage = effect.title, effect.stage
         self.place = 0  # of the effect in its scene
-        self.turns, self.takes_turns = 1, True  # of exchange with the medium; whether it can
+        self.turns = 1  # of exchange with the medium in a step
         self.values = Values(self._resolve(effect, binding.batch))
 
     @staticmethod
@@ -271,14 +279,14 @@ class BoundEffect:
             if isinstance(value, ByType):
                 out.append(CELL_TYPE)
             if name in kept:
-                first = _DrawnValue(self.values[name])
+                first = DrawnValue(self.values[name])
                 out.append(dataclasses.replace(kept[name], initial=first))
         return out
 
     def _bound(self, field: Field) -> Field:
         if not callable(field.initial):
             return field
-        return dataclasses.replace(field, initial=_FirstValue(field.initial, self.values))
+        return dataclasses.replace(field, initial=FirstValue(field.initial, self.values))
 
     def reads(self) -> tuple[str, ...]:
         """Names of what a step reads; the fields of its own drawn values are among them."""
@@ -357,6 +365,10 @@ class BoundEffect:
         """The signals that it makes cells exchange with the medium, in one or more `turns`."""
         return ()
 
+    def moves_by(self, transport: Any) -> bool:
+        """Whether it moves the signals that it exchanges itself, by the medium's transport."""
+        return False
+
     @property
     def by_kernels(self) -> bool:
         return self.effect.by_kernels
@@ -417,24 +429,3 @@ class Concern:
     where: torch.Tensor
     steps: int
     text: Callable[[torch.Tensor, torch.Tensor], str]
-
-
-@dataclass(frozen=True, eq=False)
-class _FirstValue:
-    """A field's first value, with the effect's resolved values."""
-
-    initial: Any
-    values: Values
-
-    def __call__(self, state: State, rows: torch.Tensor) -> torch.Tensor:
-        return self.initial(state, rows, self.values)
-
-
-@dataclass(frozen=True, eq=False)
-class _DrawnValue:
-    """The first value of a field that keeps what is drawn for a cell."""
-
-    value: Resolved
-
-    def __call__(self, state: State, rows: torch.Tensor) -> torch.Tensor:
-        return self.value.drawn(state, rows)

@@ -333,3 +333,24 @@ def drawn_field(title: str, name: str, value: Any) -> Field:
     )
     rule = "copy" if is_inherited(value) else "reset"
     return Field(plain, f"{name} of the {title}, drawn for the cell", at_division=rule)
+
+
+@dataclass(frozen=True, eq=False)
+class FirstValue:
+    """A field's first value, with the effect's resolved values."""
+
+    initial: Any
+    values: Values
+
+    def __call__(self, state: State, rows: Tensor) -> Tensor:
+        return self.initial(state, rows, self.values)
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnValue:
+    """The first value of a field that keeps what is drawn for a cell."""
+
+    value: Resolved
+
+    def __call__(self, state: State, rows: Tensor) -> Tensor:
+        return self.value.drawn(state, rows)

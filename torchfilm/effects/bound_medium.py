@@ -15,7 +15,6 @@ from torchfilm.effect import (
     CIRCUIT,
     DIVISION,
     GRID_COVERAGE,
-    NUTRITION,
     Binding,
     BoundEffect,
 )  # fmt: skip
@@ -107,8 +106,8 @@ class FirstHalf(_MediumPart):
         return self.transport.carried(state, dt / 2, dt / 2 / self.effect.steps)
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        often = self.transport.in_turns | self.transport.eaten_in_turns
-        whole = len(often) < len(self.effect.signals)
+        often = self.transport.in_turns
+        whole = len(often | self.transport.coupled) < len(self.effect.signals)
         first = dt / 2 / self.effect.steps if often else dt / 2
         hours = f"{first:g} h" + (f" or {dt / 2:g} h" if whole and first < dt / 2 else "")
         return [f"over {hours}, by the methods that the main part of transport lists"]
@@ -119,8 +118,6 @@ class FirstHalf(_MediumPart):
 
 class BoundMedium(_MediumPart):
     """Transports signals after exchange with the cells: over the second half of a step, or all."""
-
-    eaten: frozenset[str] = frozenset()  # signals that nutrition takes
 
     def declares(self) -> list[Field]:
         first = self.transport.first
@@ -151,38 +148,29 @@ class BoundMedium(_MediumPart):
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         others = [e for e in effects if e.place != self.place and e.stage > BEFORE_CELLS]
         circuits = [e for e in others if e.stage == CIRCUIT]
-        eaters = [e for e in others if e.stage == NUTRITION and e.exchanges()]
-        # what acts once in a step finds its signals half way
+        # what acts once in a step finds its signals half way, but for those that nutrition carries
         known = lambda once: {n for e in once for n in (*e.reads(), *e.writes())}
-        given = {n for e in circuits for n in e.exchanges()}
-        for eater in eaters:
-            self.eaten |= {*eater.exchanges()} - given
-            rest = known([e for e in others if e is not eater and e.stage <= CIRCUIT])
-            names = frozenset(n for n in eater.exchanges() if OUTSIDE + n not in rest)
-            if len(names) == len(eater.exchanges()):
-                eater.turns, self.transport.eaten_in_turns = self.effect.steps, names
-            else:
-                eater.takes_turns = False
+        for eater in [e for e in others if e.moves_by(self.transport)]:
+            self.transport.coupled |= {*eater.exchanges()}
         if any(e.exchanges() for e in circuits):
             for effect in circuits:
                 effect.turns = self.effect.steps
             once = known([e for e in others if e.stage < CIRCUIT])
             names = frozenset(n for n in self.effect.signals if OUTSIDE + n not in once)
-            self.transport.in_turns = names
+            self.transport.in_turns = names - self.transport.coupled
 
     def step(self, state: State, dt: float) -> State:
         """Transport to the end of the step."""
         part = (0.5 if self.effect.halves else 1.0) * dt
         return self.transport.carried(state, part, part / self.effect.steps)
 
-    def between(self, state: State, dt: float, names: frozenset[str]) -> State:
-        """The state after transport of some signals between two turns of cells in a step."""
-        part = dt / self.effect.steps
+    def between(self, state: State, dt: float) -> State:
+        """The state after transport between two turns of circuits in a step."""
+        part, names = dt / self.effect.steps, self.transport.in_turns
         return self.transport.carried(state, dt, part, 2 if self.effect.halves else 1, names)
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        often = self.transport.in_turns | self.transport.eaten_in_turns
-        return self.effect.numerics(dt, state, often, self.eaten)
+        return self.effect.numerics(dt, state, self.transport.in_turns, self.transport.coupled)
 
 
 class GridCoverage(_MediumPart):

@@ -106,10 +106,11 @@ class Medium(Effect):
     Default: "exponential" where possible, else "series". splitting: "strang", half of transport
     before exchange with the cells and half after, or "lie", exchange and then transport. Strang
     makes the error of the signal many times smaller, for one more transport per step. steps: of
-    transport within one step of the scene. Circuits and transport, and `Monod` and transport, take
-    turns in each of them: n make the error of exchange n times smaller or better, without a step of
-    growth and contacts more. backend: "compiled" kernels or "torch" for transport.
-    Default: compiled where the device is the CPU and Numba is there; gradients always by torch.
+    transport within one step of the scene. Circuits and transport take turns in each of them: n
+    make the error of exchange n times smaller or better, without a step of growth and contacts
+    more. method and splitting are not for a nutrient: `Monod` moves it, together with uptake.
+    backend: "compiled" kernels or "torch" for transport. Default: compiled where the device is the
+    CPU and Numba is there; gradients always by torch.
     """
 
     signals: Mapping[str, Signal]
@@ -271,10 +272,10 @@ class Medium(Effect):
         dt: float,
         state: State,
         exchanged: Collection[str] = frozenset(),
-        eaten: Collection[str] = frozenset(),
+        coupled: Collection[str] = frozenset(),
     ) -> list[str]:
-        """exchanged: the signals that cells and transport move in turns, `steps` of them. eaten:
-        those that nutrition takes, which says itself what turns cost them."""
+        """exchanged: the signals that cells and transport move in turns, `steps` of them. coupled:
+        those that nutrition moves, which describes that itself."""
         assert state.layout is not None
         shape, spacing = state.layout.grid.shape[0].tolist(), state.layout.grid.spacing
         voxels = (
@@ -289,7 +290,10 @@ class Medium(Effect):
         if exchanged and self.steps > 1:
             names = ", ".join(sorted(exchanged))
             lines.append(f"{self.steps} turns of cells and transport in a step, for {names}")
+        lines += [f"{n}: moved by nutrition, together with uptake" for n in sorted(coupled)]
         for name, signal in self.signals.items():
+            if name in coupled:
+                continue
             whole = not self.halves or (name in exchanged and self.steps > 1)
             part = dt / self.steps / (1 if whole else 2)
             method, why = self.method_of(name)
@@ -304,8 +308,7 @@ class Medium(Effect):
             who = self.backend_on(state.device) if method in COMPILED else "torch"
             who = "compiled; by torch where gradients are required" if who == "compiled" else who
             lines.append(f"{name}: {method}, {order} ({why}), {who}; dt·K/h² = {ratio}")
-            if name not in eaten:
-                lines += self._cost_of_turns(name, dt, state, name in exchanged)
+            lines += self._cost_of_turns(name, dt, state, name in exchanged)
         return lines
 
     def _cost_of_turns(self, name: str, dt: float, state: State, often: bool) -> list[str]:

@@ -20,8 +20,10 @@ from torchfilm.signals.layout import Layout
 from torchfilm.signals.transport import Carrier, carry, check_method, choose, prepare
 from torchfilm.signals.transport_operator import Operator
 from torchfilm.signals.transport_rates import build_operator
+from torchfilm.signals.transport_uptake import UptakeTransport
 from torchfilm.state import OUTSIDE, State
 from torchfilm.tools import checks
+from torchfilm.tools.backends import why_torch
 from torchfilm.tools.tangents import tracked
 
 if TYPE_CHECKING:
@@ -36,7 +38,8 @@ class Transport:
 
     def __init__(self, medium: Medium, binding: Binding):
         self.medium, batch = medium, binding.batch
-        self.compiled = medium.backend_on(batch.device) == "compiled"
+        self.by_torch = why_torch("Medium", medium.backend, batch.device)
+        self.compiled = not self.by_torch
         self.signals: dict[str, Signal] = snapshot(medium.signals, "Medium.signals", batch)
         self.flows: dict[str, Flow] = {
             n: snapshot(medium.flow_of(n), f"flow of the signal {n!r}", batch)
@@ -57,12 +60,13 @@ class Transport:
                 else None
             ),
         }
-        # signals that take turns with cells, in the medium's steps: with circuits, with nutrition
+        # signals that take turns with circuits, in the medium's steps; that nutrition carries
         self.in_turns: frozenset[str] = frozenset()
-        self.eaten_in_turns: frozenset[str] = frozenset()
+        self.coupled: frozenset[str] = frozenset()
         self._of_step: dict[Any, Carrier] | None = None
         # weak keys: a grid no longer in use releases its steps
         self.carriers: WeakKeyDictionary[Grid, dict[Any, Carrier]] = WeakKeyDictionary()
+        self._eaten: WeakKeyDictionary[Grid, dict[Any, list[UptakeTransport]]] = WeakKeyDictionary()
 
     def lay(self, state: State) -> State:
         """The state with one grid per colony, as `box` and `spacing` give it."""
@@ -106,8 +110,8 @@ class Transport:
         assert state.layout is not None
         grid, steps = state.layout.grid, self.medium.steps
         changed = {}
-        for name in self.signals if names is None else sorted(names):
-            often = name in self.in_turns or name in self.eaten_in_turns
+        for name in sorted(self.signals.keys() - self.coupled if names is None else names):
+            often = name in self.in_turns
             whole, count = (turn, pieces) if often else (hours, steps)
             count = 1 if often and self.medium.method_of(name)[0] in EXACT else count
             part = whole / count
@@ -118,12 +122,34 @@ class Transport:
             changed[OUTSIDE + name] = values
         return state.with_fields(**changed)
 
+    def with_uptake(self, name: str, state: State) -> list[UptakeTransport]:
+        """Transport of a signal that cells take up, on the grids of each shape; it is reused while
+        they stay."""
+        assert state.layout is not None
+        grid = state.layout.grid
+        key = (name, state.dtype, torch.is_grad_enabled())
+        known = {} if self._tracked(name) else self._eaten.setdefault(grid, {})
+        if key not in known:
+            known[key] = [
+                UptakeTransport(self._operator(name, state, b), b.shape, self.compiled)
+                for b in grid.batches
+            ]
+        return known[key]
+
+    def exchanges_per_hour(self, name: str, state: State) -> float:
+        """The greatest rate at which a voxel loses a signal that cells take up, 1/h, but for
+        them."""
+        return max(float(x.operator.loss.amax()) for x in self.with_uptake(name, state))
+
+    def _tracked(self, name: str) -> bool:
+        """Whether derivatives by what a signal's transport depends on are wanted."""
+        numbers = [x for x in self._numbers(name) if isinstance(x, Tensor)]
+        return tracked(*numbers, *_closure_tensors(self.signals[name], self.flows[name]))
+
     def carrier(self, name: str, state: State, batch: GridBatch, dt: float) -> Carrier:
         """The step of a signal on grids of one shape; it is reused while the grids stay."""
         assert state.layout is not None
-        numbers = [x for x in self._numbers(name) if isinstance(x, Tensor)]
-        numbers += _closure_tensors(self.signals[name], self.flows[name])
-        if tracked(*numbers):
+        if self._tracked(name):
             kept, own = {} if self._of_step is None else self._of_step, (name, batch.shape, dt)
             if own not in kept:
                 kept[own] = self._prepare(name, state, batch, dt)[0]

@@ -89,6 +89,24 @@ def bicgstab(x, r, pad, grid, many, target, most, spare):
             p[pad + i] = r[i] + beta * (p[pad + i] - omega * v[i])
 
 
+@kernel
+def backward_euler(x, b, r, pad, grid, many, tolerance, symmetric, most, spare):
+    """Solve (I + many (I − P)) x = b for one grid, from x, and leave the residual in r. Whether it
+    converged."""
+    target = tolerance**2 * dot(b, b)
+    for trial in range(4):
+        product(x, r, pad, grid, many)
+        for i in range(b.size):
+            r[i] = b[i] - r[i]
+        if trial == 3 or not dot(r, r) > target:
+            break
+        if symmetric:
+            conjugate_gradients(x, r, pad, grid, many, target, most, spare)
+        else:
+            bicgstab(x, r, pad, grid, many, target, most, spare)
+    return dot(r, r) <= 100 * target
+
+
 @kernel(entry=True)
 def solve(
     begin, end, starts, strides, stay, ups, downs, wrap_to, wrap_from, wraps, many, tolerance,
@@ -118,18 +136,7 @@ def solve(
             more = gained[c if gained.shape[0] > 1 else 0]
             for i in range(size):
                 b[i] += more[i]
-        target = tolerance[own] ** 2 * dot(b, b)
-        for trial in range(4):
-            product(x, r, pad, grid, many[own])
-            for i in range(size):
-                r[i] = b[i] - r[i]
-            if trial == 3 or not dot(r, r) > target:
-                break
-            if symmetric:
-                conjugate_gradients(x, r, pad, grid, many[own], target, most, spare)
-            else:
-                bicgstab(x, r, pad, grid, many[own], target, most, spare)
-        good = dot(r, r) <= 100 * target
+        good = backward_euler(x, b, r, pad, grid, many[own], tolerance[own], symmetric, most, spare)
         for i in range(size):
             # with its residual the change is what T makes of x: amount is conserved, but for the
             # rounding of λΔt exchanges

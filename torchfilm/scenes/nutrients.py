@@ -23,15 +23,13 @@ def nutrient_limited(
     size: float = 240.0,
     spacing: float = 4.0,
     length_drag: float = 1e5,
-    steps: int = 1,
 ) -> Scene:
     """A colony that consumes a nutrient, which diffuses from the edge of a box `size` µm wide.
 
     At the edge the nutrient is kept at `supply`. Only a rim of the colony grows. Where diffusion is
     slow, bumps of the rim grow faster and branch. Growth is `rate` (1/h) · s/(half + s).
     growth_yield: µm³ of cell from one unit of concentration × µm³. The layer is 1 µm deep, like the
-    cells. length_drag: with the default the nutrient limits growth, and pressure does not. steps:
-    turns of uptake and transport in a step; where diffusion is fast, more are needed.
+    cells. length_drag: with the default the nutrient limits growth, and pressure does not.
     """
     edge = Dirichlet(supply)
     half_size = size / 2
@@ -46,6 +44,5 @@ def nutrient_limited(
             spacing=spacing,
             depth=1.0,
             boundary=BoundaryConditions(x=edge, y=edge),
-            steps=steps,
         ),
     )

@@ -13,7 +13,7 @@ from torchfilm.signals.compiled import may_run
 from torchfilm.signals.grid import Shape
 from torchfilm.signals.transport_exponential import Exponential
 from torchfilm.signals.transport_iterative import MAX_ITERATIONS
-from torchfilm.signals.transport_series import Series
+from torchfilm.signals.transport_series import Mixing, Series
 from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.threads import Shared
 
@@ -126,12 +126,43 @@ class CompiledSeries:
 
 def compiled_series(stepper: Series, shape: Shape) -> CompiledSeries | None:
     """The same step compiled, or None where kernels may not run it."""
-    mixing = stepper.mixing
-    given = [mixing.stay, *(x for _, up, down in mixing.gains for x in (up, down))]
-    given += [] if stepper.gained is None else [stepper.gained]
+    given = _numbers(stepper.mixing) + ([] if stepper.gained is None else [stepper.gained])
     if not may_run(*given):
         return None
     count = max(stepper.weights.shape[1], *(x.shape[0] for x in given))
+    terms = torch.as_tensor(stepper.terms).expand(count)
+    if stepper.far is not None:
+        terms = torch.where(stepper.far, 0, terms)
+    gained = _no_gain(shape) if stepper.gained is None else stepper.gained.detach().flatten(1)
+    weights = stepper.weights.t().expand(count, -1)
+    arrays = (*mixing_arrays(stepper.mixing, shape, count), *_packed(weights, terms, gained))
+    solve, symmetric = None, True
+    if stepper.far is not None and stepper.solved is not None:
+        one, operator = stepper.solved, stepper.solved.operator
+        symmetric = operator.symmetric
+        many = torch.where(stepper.far, stepper.exchanges, 0.0).expand(count)
+        more = _no_gain(shape)
+        if operator.gain is not None:
+            more = (one.dt * operator.gain.detach()).expand(-1, *shape).flatten(1)
+        solve = _packed(many, one.tolerance.expand(count), more)
+    return CompiledSeries(stepper, shape, arrays, solve, symmetric)
+
+
+def _numbers(mixing: Mixing) -> list[Tensor]:
+    return [mixing.stay, *(x for _, up, down in mixing.gains for x in (up, down))]
+
+
+def _no_gain(shape: Shape) -> Tensor:
+    return torch.zeros(0, shape[0] * shape[1] * shape[2], dtype=torch.float64)
+
+
+def _packed(*given: Tensor) -> tuple[np.ndarray, ...]:
+    return tuple(np.ascontiguousarray(x.numpy()) for x in given)
+
+
+def mixing_arrays(mixing: Mixing, shape: Shape, count: int) -> tuple[np.ndarray, ...]:
+    """strides, stay, ups, downs, wrap_to, wrap_from and wraps of P, as `kernels.transport.mix`
+    takes them, of `count` colonies or 1."""
     number = torch.arange(shape[0] * shape[1] * shape[2]).view(shape)
     whole = lambda x: x.detach().expand(count, *shape).flatten(1).clone()
     ups: list[Tensor] = []
@@ -151,28 +182,7 @@ def compiled_series(stepper: Series, shape: Shape) -> CompiledSeries | None:
     wraps = torch.cat(parts, 1) if parts else nothing[:, 0:0, 0]
     there = (wraps > 0).any(0)  # elsewhere no face is periodic
     places = [torch.cat(x)[there] if x else number[:0, 0, 0] for x in (to, source)]
-    terms = torch.as_tensor(stepper.terms).expand(count)
-    if stepper.far is not None:
-        terms = torch.where(stepper.far, 0, terms)
-    strides = [number.stride(dim - 1) for dim, _, _ in mixing.gains]
-    gained = (
-        nothing[:0].flatten(1) if stepper.gained is None else stepper.gained.detach().flatten(1)
-    )
-    weights = stepper.weights.t().expand(count, -1)
-    arrays = (
-        whole(mixing.stay), joined(ups), joined(downs), *places, wraps[:, there], weights, terms,
-        gained,
+    strides = np.array([number.stride(dim - 1) for dim, _, _ in mixing.gains], np.int64)
+    return strides, *_packed(
+        whole(mixing.stay), joined(ups), joined(downs), *places, wraps[:, there]
     )  # fmt: skip
-    packed = lambda *arrays: tuple(np.ascontiguousarray(x.numpy()) for x in arrays)
-    solve, symmetric = None, True
-    if stepper.far is not None and stepper.solved is not None:
-        one, operator = stepper.solved, stepper.solved.operator
-        symmetric = operator.symmetric
-        many = torch.where(stepper.far, stepper.exchanges, 0.0).expand(count)
-        more = nothing[:0].flatten(1)
-        if operator.gain is not None:
-            more = (one.dt * operator.gain.detach()).expand(-1, *shape).flatten(1)
-        solve = packed(many, one.tolerance.expand(count), more)
-    return CompiledSeries(
-        stepper, shape, (np.array(strides, np.int64), *packed(*arrays)), solve, symmetric
-    )

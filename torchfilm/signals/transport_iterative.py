@@ -20,7 +20,7 @@ from torch import Tensor
 from torchfilm.signals.transport_operator import Operator, apply
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
-from torchfilm.tools.tangents import both, with_tangent
+from torchfilm.tools.tangents import both, refuse_second, with_tangent
 
 Map = Callable[[Tensor], Tensor]
 # The residual allowed, relative to the norm of the right-hand side. The solve is in float64, where
@@ -135,6 +135,7 @@ class _KrylovAdjoint(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad: Tensor):
+        refuse_second("a solve of transport")
         left, symmetric = ctx.left, ctx.of.operator.symmetric
         if not symmetric:
             with torch.enable_grad():

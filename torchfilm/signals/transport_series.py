@@ -88,8 +88,8 @@ def prepare_series(operator: Operator, dt: float) -> Series:
     rate = torch.where(fastest > 0, ABOVE * fastest, 1.0)
     mean = (rate * dt).cpu().numpy()
     far = mean > MOST
-    weights, tails = _poisson(np.where(far, 0.0, mean), torch.finfo(operator.dtype).eps * CUT)
-    mixing = _mixing(operator, rate.reshape(-1, 1, 1, 1))
+    weights, tails = poisson(np.where(far, 0.0, mean), torch.finfo(operator.dtype).eps * CUT)
+    mixing = mixing_of(operator, rate.reshape(-1, 1, 1, 1))
     on_device = lambda x: torch.as_tensor(x, device=operator.device)
     gained = None
     if operator.gain is not None:
@@ -116,7 +116,7 @@ def _mean(mixing: Mixing, weights: Tensor, v: Tensor) -> Tensor:
     return out
 
 
-def _mixing(operator: Operator, rate: Tensor) -> Mixing:
+def mixing_of(operator: Operator, rate: Tensor) -> Mixing:
     """P of an operator; rate: λ, (B or 1, 1, 1, 1)."""
     gains = []
     for axis in operator.axes:
@@ -133,7 +133,7 @@ def _mixing(operator: Operator, rate: Tensor) -> Mixing:
     return Mixing(1 - operator.loss / rate, tuple(gains))
 
 
-def _poisson(mean: np.ndarray, cut: float) -> tuple[np.ndarray, np.ndarray]:
+def poisson(mean: np.ndarray, cut: float) -> tuple[np.ndarray, np.ndarray]:
     """The probabilities of 0, 1, … events of a Poisson distribution, and those of more events than
     that, (terms, B) each.
 

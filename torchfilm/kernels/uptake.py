@@ -1,0 +1,267 @@
+"""Uptake of a signal by cells and its transport, solved together: a step for the grids of all
+colonies, as `signals.uptake` and `signals.transport_uptake` make it.
+
+A colony's iterations come one after the other, so that its grid stays in the processor's cache.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.transport import exchanged
+from torchfilm.kernels.transport_solve import backward_euler
+
+# As in `tools.fixed_point`.
+DEPTH, RIDGE, TINY = 3, 1e-12, 1e-300
+
+
+@kernel
+def poisson(mean, cut, weights, tails):
+    """As `transport_series.poisson`, of one colony: the probabilities of 0, 1, … events, those of
+    more events than that, and how many terms count."""
+    count = int(mean + 10 * np.sqrt(mean) + 30)
+    total, log_of, log_factorial = 0.0, np.log(mean), 0.0
+    for k in range(count):
+        log_factorial += np.log(k) if k > 0 else 0.0
+        chance = np.exp(k * log_of - mean - log_factorial)
+        weights[k] = 0.0 if chance < cut and k > mean else chance
+        total += weights[k]
+    used, above, all_tails = 0, 0.0, 0.0
+    for k in range(count - 1, -1, -1):  # summed from the rarest: small numbers first
+        weights[k] /= total
+        tails[k] = above
+        all_tails += above
+        above += weights[k]
+        used = max(used, k + 1) if weights[k] > 0 else used
+    for k in range(used):
+        tails[k] *= mean / all_tails if all_tails > 0 else 1.0
+    return used
+
+
+@kernel
+def put_taking(taking, mean, cells):
+    """As `uptake.Eaters.taking`, of the cells of one colony."""
+    first, fed, volume, greatest, half, gain, dt = cells
+    for i in range(mean.size):
+        growth = greatest[first + i] / (half[first + i] + mean[i])
+        x = growth * mean[i] * dt
+        ratio = np.expm1(x) / x if x > 1e-300 else 1.0
+        own = volume[first + i] / gain[first + i] * growth * ratio
+        taking[i] = own if fed[first + i] else 0.0
+
+
+@kernel
+def put_losses(loss, taking, node, weight, start, voxel_volume):
+    """The rate at which each voxel of one grid loses, 1/h. node, weight: of the colony's cells;
+    start: the grid's first voxel."""
+    loss[:] = 0.0
+    for i in range(taking.size):
+        for k in range(node.shape[1]):
+            loss[node[i, k] - start] += weight[i, k] * (taking[i] / voxel_volume)
+
+
+@kernel
+def put_read(new, field, node, weight, start):
+    """What each cell of one colony finds of its grid."""
+    for i in range(new.size):
+        total = 0.0
+        for k in range(node.shape[1]):
+            total += np.float64(weight[i, k]) * field[node[i, k] - start]
+        new[i] = total
+
+
+@kernel
+def series(u, pad, grid, weights, tails, used, gained, times, end, mean, spare):
+    """`Eaten._series` for one grid: from u (padded) to end and mean. gained: q/λ or empty. times:
+    λΔt."""
+    strides, stay, ups, downs, wrap_to, wrap_from, wraps, _ = grid
+    v, new = spare[0], spare[1]
+    for i in range(end.size):
+        v[pad + i] = u[i]
+        end[i], mean[i] = weights[0] * u[i], tails[0] * u[i]
+    for n in range(1, used):
+        exchanged(v, new, pad, strides, stay, ups, downs)
+        for w in range(wrap_to.size):
+            new[pad + wrap_to[w]] += wraps[w] * v[pad + wrap_from[w]]
+        for i in range(gained.size):
+            new[pad + i] += gained[i]
+        for i in range(end.size):
+            end[i] += weights[n] * new[pad + i]
+            mean[i] += tails[n] * new[pad + i]
+        v, new = new, v
+    for i in range(end.size):
+        mean[i] /= times
+
+
+@kernel
+def carry_once(u, more, dt, pad, operator, room, far, settings):
+    """One grid over dt hours with the losses in `room`: its end and mean go to room. Whether the
+    solve converged, and whether it was one of backward Euler, which it stays once it is `far`.
+
+    u: (voxels,). more: gain, 1/h, or empty. operator: strides … wraps of one colony, its λ, and
+    whether there is no flow.
+    """
+    strides, stay, ups, downs, wrap_to, wrap_from, wraps, rate, symmetric = operator
+    loss, still, x, r, b, final, mean, spare, mixed, weights, tails = room
+    above, cut, events, tolerance, rounding, most = settings
+    fastest = 0.0
+    for i in range(u.size):
+        still[i] = (1 - stay[i]) * rate + loss[i]
+        fastest = max(fastest, still[i])
+    at = above * fastest if fastest > 0 else 1.0
+    times, scale = at * dt, rate / at
+    far = far or times > events
+    for i in range(u.size):
+        still[i] = 1 - still[i] / at
+    grid = strides, still, ups * scale, downs * scale, wrap_to, wrap_from, wraps * scale, mixed
+    if not far:
+        used = poisson(times, cut, weights, tails)
+        series(u, pad, grid, weights, tails, used, more / at, times, final, mean, spare)
+        return True, far
+    within = max(tolerance, rounding * dt * fastest)
+    good = backward_euler(x, b, r, pad, grid, times, within, symmetric, most, spare)
+    for i in range(u.size):
+        # with its residual the change is what T makes of x: amount is conserved
+        mean[i], final[i] = x[pad + i], max(x[pad + i] + r[i], 0.0)
+    return good, far
+
+
+@kernel
+def solve_mixed(matrix, right, count):
+    """`fixed_point._solve` for one group: the solution in right."""
+    for i in range(count):
+        matrix[i, i] = matrix[i, i] * (1 + RIDGE) + TINY
+    for i in range(count):
+        for k in range(i + 1, count):
+            part = matrix[k, i] / matrix[i, i]
+            for j in range(i, count):
+                matrix[k, j] -= part * matrix[i, j]
+            right[k] -= part * right[i]
+    for i in range(count - 1, -1, -1):
+        for j in range(i + 1, count):
+            right[i] -= matrix[i, j] * right[j]
+        right[i] /= matrix[i, i]
+
+
+@kernel
+def next_guess(mean, new, before, changes, matrix, right, half, fed, close, done_before):
+    """One iteration of all cells of a colony, as `tools.fixed_point`: the next mean, in place.
+    Whether all were close, and whether all are within 100 times that.
+
+    before: (2, cells), the last value and residual. changes: (DEPTH, 2, cells), the last changes of
+    them, in a ring.
+    """
+    done, near = True, True
+    for i in range(mean.size):
+        new[i] = new[i] if fed[i] else mean[i]
+        off = abs(new[i] - mean[i]) / (half[i] + mean[i])
+        near = near and off <= 100 * close
+        done = done and not off > close  # a NaN stays one
+    if done:
+        return done, near
+    count = min(done_before, DEPTH)
+    if count > 0:
+        slot = (done_before - 1) % DEPTH
+        for i in range(mean.size):
+            changes[slot, 0, i] = new[i] - before[0, i]
+            changes[slot, 1, i] = new[i] - mean[i] - before[1, i]
+    for a in range(count):
+        for b in range(a, count):
+            total = 0.0
+            for i in range(mean.size):
+                weight = 1 / (half[i] + mean[i])
+                total += changes[a, 1, i] * weight * (changes[b, 1, i] * weight)
+            matrix[a, b] = matrix[b, a] = total
+        right[a] = 0.0
+        for i in range(mean.size):
+            weight = 1 / (half[i] + mean[i])
+            right[a] += changes[a, 1, i] * weight * ((new[i] - mean[i]) * weight)
+    solve_mixed(matrix, right, count)
+    for i in range(mean.size):
+        before[0, i], before[1, i] = new[i], new[i] - mean[i]
+        ahead = new[i]
+        for a in range(count):
+            ahead -= right[a] * changes[a, 0, i]
+        mean[i] = ahead if ahead > 0 else new[i]
+    return done, near
+
+
+@kernel
+def eat_grid(u, more, dt, pad, operator, room, cells, place, found, out, settings):
+    """One grid over dt hours. out: (2, cells), what they found and took. The iterations, whether
+    they failed, and whether the grid has numbers."""
+    first, fed, volume, greatest, half, gain, _ = cells
+    node, weight, start, voxel_volume = place
+    close, most, rest = settings
+    size, last = found.size, first + found.size
+    mean, new, taking = found.copy(), out[0], np.empty(size)
+    before, changes = np.empty((2, size)), np.empty((DEPTH, 2, size))
+    matrix, right = np.empty((DEPTH, DEPTH)), np.empty(DEPTH)
+    far, good, near, count = False, True, True, 0
+    while True:
+        put_taking(taking, mean, cells)
+        put_losses(room[0], taking, node, weight, start, voxel_volume)
+        good, far = carry_once(u, more, dt, pad, operator, room, far, rest)
+        put_read(new, room[6], node, weight, start)
+        done, near = next_guess(
+            mean, new, before, changes, matrix, right, half[first:last], fed[first:last], close,
+            count,
+        )  # fmt: skip
+        count += 1
+        if done or count == most or not good:
+            break
+    for i in range(size):
+        k = first + i
+        grown = np.expm1(greatest[k] * found[i] / (half[k] + found[i]) * dt)
+        out[1, i] = taking[i] * new[i] * dt if fed[k] else volume[k] / gain[k] * grown
+    return count, not (near and good), good
+
+
+@kernel(entry=True)
+def eat(
+    begin, end, starts, colonies, ends, strides, stay, ups, downs, wrap_to, wrap_from, wraps, rate,
+    symmetric, gained, node, weight, fed, volume, greatest, half, gain, found, voxel_volume, dt,
+    settings, values, out, of_cells, iterations, failed,
+):  # fmt: skip
+    """The grids begin … end of one shape after a step of dt hours, from values to out, (voxels,) of
+    all colonies; and what their cells found and took: of_cells (2, N).
+
+    colonies: of the grids. ends: where the cells of each colony begin, (B + 1,). strides … wraps:
+    as `transport.mix` takes them, without uptake, at λ = rate (b or 1,). gained: 1/h, (b or 1 or 0,
+    voxels). fed … found: (N,) as `uptake.Eaters` has them, and s at the start. settings: close,
+    most iterations, and of the series and the solve: 1.01, cut, most events, tolerance, rounding,
+    most.
+    """
+    size, pad = stay.shape[1], 0
+    for stride in strides:
+        pad = max(pad, stride)
+    wide, terms = size + 2 * pad, int(settings[2][2] + 10 * np.sqrt(settings[2][2]) + 31)
+    fields, wider = np.empty((6, size)), np.zeros((7, wide))
+    b, x = fields[3], wider[0]
+    room = (
+        fields[0], fields[1], x, fields[2], b, fields[4], fields[5], wider[2:], wider[1],
+        np.empty(terms), np.empty(terms),
+    )  # fmt: skip
+    u = np.empty(size)
+    for c in range(begin, end):
+        own = c if stay.shape[0] > 1 else 0
+        colony, start = colonies[c], starts[c]
+        first, last = ends[colony], ends[colony + 1]
+        operator = (
+            strides, stay[own], ups[own], downs[own], wrap_to, wrap_from, wraps[own], rate[own],
+            symmetric,
+        )  # fmt: skip
+        more = gained[c if gained.shape[0] > 1 else 0] if gained.shape[0] > 0 else u[:0]
+        for i in range(size):
+            u[i] = b[i] = x[pad + i] = values[start + i]
+        for i in range(more.size):
+            b[i] += dt * more[i]
+        cells = first, fed, volume, greatest, half, gain, dt
+        place = node[first:last], weight[first:last], start, voxel_volume
+        iterations[colony], failed[colony], good = eat_grid(
+            u, more, dt, pad, operator, room, cells, place, found[first:last],
+            of_cells[:, first:last], settings,
+        )  # fmt: skip
+        for i in range(size):
+            out[start + i] = room[5][i] if good else np.nan

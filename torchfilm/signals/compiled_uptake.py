@@ -1,0 +1,101 @@
+"""Uptake and transport of a signal together by compiled kernels, on the CPU where no gradient is
+wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfilm.signals.compiled import may_run
+from torchfilm.signals.compiled_transport import mixing_arrays
+from torchfilm.signals.grid import Grid, Shape
+from torchfilm.signals.transport_iterative import MAX_ITERATIONS, ROUNDING, TOLERANCE
+from torchfilm.signals.transport_operator import Operator
+from torchfilm.signals.transport_series import ABOVE, CUT, mixing_of
+from torchfilm.tools import subnormals
+from torchfilm.tools.numba_calls import as_array
+from torchfilm.tools.threads import Shared
+
+if TYPE_CHECKING:
+    from torchfilm.signals.uptake import Eaters
+
+# λΔt up to which a colony takes the series; each iteration of uptake needs all of its terms.
+EVENTS = 250.0
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledUptake:
+    """An operator in arrays as `kernels.uptake.eat` takes them."""
+
+    mixing: tuple[np.ndarray, ...]
+    rate: np.ndarray
+    gained: np.ndarray
+    symmetric: bool
+    cut: float
+
+    @cached_property
+    def shared(self) -> Shared:
+        return Shared()
+
+
+def compiled_uptake(operator: Operator, shape: Shape) -> CompiledUptake | None:
+    """The operator for kernels, or None where they may not run it."""
+    gain = operator.gain
+    numbers = [operator.loss, *(x for a in operator.axes for x in (a.up, a.down))]
+    if not may_run(*numbers, *([] if gain is None else [gain])):
+        return None
+    fastest = operator.loss.flatten(1).amax(1)
+    rate = torch.where(fastest > 0, ABOVE * fastest, 1.0)
+    mixing = mixing_of(operator, rate.reshape(-1, 1, 1, 1))
+    gains = [x for _, up, down in mixing.gains for x in (up, down)]
+    count = max(rate.numel(), *(x.shape[0] for x in [mixing.stay, *gains]))
+    none = torch.zeros(0, operator.loss[0].numel(), dtype=torch.float64)
+    more = none if gain is None else gain.expand(-1, *shape).flatten(1)
+    return CompiledUptake(
+        mixing_arrays(mixing, shape, count),
+        np.ascontiguousarray(rate.expand(count).numpy()),
+        np.ascontiguousarray(more.numpy()),
+        operator.symmetric,
+        torch.finfo(operator.dtype).eps * CUT,
+    )
+
+
+def eat(
+    eaters: Eaters, grid: Grid, kernels: Sequence[CompiledUptake], field: Tensor, found: Tensor,
+    close: float, most: int,
+) -> tuple[Tensor, ...]:  # fmt: skip
+    """As `uptake.solve`, from the same arguments: end, mean, amount, iterations and failed."""
+    from torchfilm.kernels.uptake import eat as run
+
+    f64 = torch.float64
+    end, cells = torch.empty_like(field), field.new_empty(2, len(found), dtype=f64)
+    counted = torch.zeros(eaters.groups.size, dtype=torch.int64)
+    failed = torch.zeros(eaters.groups.size, dtype=torch.bool)
+    of_cells = (eaters.volume, eaters.greatest, eaters.half, eaters.gain, found)
+    volume, greatest, half, gain, at_start = (as_array(x, f64) for x in of_cells)
+    node, weight = eaters.stencil.arrays
+    source = as_array(field, field.dtype)
+    # far enough below the last bit of the field; what cells take it does not concern
+    tolerance = max(TOLERANCE, torch.finfo(field.dtype).eps / 8)
+    with subnormals.as_zero():
+        for one, batch in zip(kernels, grid.batches, strict=True):
+            numbers = ABOVE, one.cut, EVENTS, tolerance, ROUNDING, MAX_ITERATIONS
+            given = (
+                batch.starts.numpy(), batch.colonies.numpy(), eaters.groups.ends, *one.mixing,
+                one.rate, one.symmetric, one.gained, node, weight, eaters.fed.numpy(), volume,
+                greatest, half, gain, at_start, eaters.stencil.voxel_volume, eaters.dt,
+                (close, most, numbers),
+                source, end.numpy(), cells.numpy(), counted.numpy(), failed.numpy(),
+            )  # fmt: skip
+            one.shared(batch.starts.numel(), partial(_run, run, given))
+    return end, *cells, counted, failed
+
+
+def _run(kernel: Callable[..., object], given: tuple[object, ...], begin: int, end: int) -> None:
+    kernel(begin, end, *given)
