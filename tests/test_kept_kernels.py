@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 MODULE = """
 from torchfilm.kernels.compiling import kernel
 
@@ -16,6 +18,27 @@ def total(x):
     for i in range(1, x.shape[0]):
         s += x[i]
     return s
+"""
+
+CALLBACK = """
+import numba
+from torchfilm.kernels.compiling import native
+
+def twice(x):
+    return 2 * x
+
+made = native(numba.float64(numba.float64), twice)
+assert made.ctypes(2.0) == 4.0
+"""
+
+FULL = """
+import errno
+from numba.core import caching
+
+def full(*given):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+caching.IndexDataCacheFile._save_data = full
 """
 
 # Between reading Numba's list and writing it again there is time enough for the other process.
@@ -79,3 +102,42 @@ def test_a_file_system_without_locks_is_none_the_worse(tmp_path: Path):
     command = [sys.executable, "-c", text]
     out = subprocess.run(command, env=settings(tmp_path), capture_output=True, text=True)
     assert (out.returncode, out.stdout, out.stderr) == (0, "4.0\n", "")
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+@pytest.mark.parametrize("size", [0, 100])
+def test_a_file_that_a_crash_cut_off_is_compiled_again(tmp_path: Path, suffix: str, size: int):
+    """Functions and callbacks: without a word, and once."""
+    (tmp_path / "summing.py").write_text(MODULE + CALLBACK)
+    text = "import numpy as np\nfrom summing import total\nprint(total(np.ones(4)))"
+    text += "\nprint(len(total.stats.cache_hits))"
+    command = [sys.executable, "-c", text]
+    run = lambda: subprocess.run(command, env=settings(tmp_path), capture_output=True, text=True)
+    assert run().stdout == "4.0\n0\n" and run().stdout == "4.0\n1\n"
+    files = list(tmp_path.rglob(f"*.{suffix}"))
+    assert len(files) == 2
+    for file in files:
+        file.write_bytes(file.read_bytes()[:size])
+    outs = run(), run()
+    found = [(x.returncode, x.stdout, x.stderr) for x in outs]
+    assert found == [(0, f"4.0\n{n}\n", "") for n in (0, 1)]
+
+
+def test_a_full_disk_costs_only_what_is_kept(tmp_path: Path):
+    """It is said once, with the folder and what to do."""
+    (tmp_path / "summing.py").write_text(MODULE + CALLBACK)
+    text = FULL + "import numpy as np\nfrom summing import total\nprint(total(np.ones(4)))"
+    command = [sys.executable, "-c", text]
+    out = subprocess.run(command, env=settings(tmp_path), capture_output=True, text=True)
+    assert (out.returncode, out.stdout) == (0, "4.0\n")
+    assert out.stderr.count("could not keep") == 1 and "XDG_CACHE_HOME" in out.stderr
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path):
+    (tmp_path / "summing.py").write_text(MODULE)
+    (tmp_path / "file").touch()
+    text = "from torchfilm.kernels.compiling import first_call\nwith first_call('a', 'b'): pass"
+    env = settings(tmp_path) | {"XDG_CACHE_HOME": str(tmp_path / "file")}
+    out = subprocess.run([sys.executable, "-c", text], env=env, capture_output=True, text=True)
+    assert "compiling b, in each process" in out.stderr
+    assert str(tmp_path / "file") in out.stderr and "XDG_CACHE_HOME" in out.stderr

@@ -51,7 +51,7 @@ def summary_table(scene: Scene, state: State, timings: Timings, seconds: float) 
         for name, s in timings.seconds.items()
     ]
     if (kernels := sys.modules.get("torchfilm.kernels.compiling")) and kernels.seconds_spent():
-        spent = f"{kernels.seconds_spent():.1f} s of these, once for this installation"
+        spent = f"{kernels.seconds_spent():.1f} s of these, {kernels.HOW_OFTEN}"
         lines.append(f"{'compiling':<28}{spent}")
     return "\n".join(lines)
 

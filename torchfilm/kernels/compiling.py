@@ -5,11 +5,12 @@ from __future__ import annotations
 import gc
 import hashlib
 import os
+import pickle
 import shutil
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ except ImportError:  # not on Windows
 import llvmlite.binding as llvm
 import numba
 import numpy as np
+from numba.core.caching import FunctionCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
@@ -33,6 +35,9 @@ config: Any = numba.config
 # For tests: `memory.give_back` overwrites what is given back, so that who reads it all the same is
 # found out.
 OVERWRITES = "TORCHFILM_OVERWRITES_MEMORY" in os.environ
+
+# What pickle raises for a file that a crash or a full disk has cut off.
+UNREADABLE = (EOFError, pickle.UnpicklingError)
 
 
 def _digest() -> str:
@@ -48,12 +53,17 @@ def _digest() -> str:
 KEPT_DAYS = 30
 
 
+def _wanted_folder() -> Path:
+    """The user's own cache of torchfilm."""
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    return Path(home) / "torchfilm"
+
+
 def cache_folder() -> Path | None:
     """Where compiled kernels are kept, or None where nothing can be written: the user's own cache,
     since compiled code that others could write must never be loaded. A new version removes what
     older ones left and nobody uses."""
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    folder = Path(home) / "torchfilm" / f"kernels-{_digest()}"
+    folder = _wanted_folder() / f"kernels-{_digest()}"
     try:
         new = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
@@ -85,6 +95,7 @@ def _remove_unused(mine: Path) -> None:
 
 
 FOLDER = cache_folder()
+HOW_OFTEN = "in each process" if FOLDER is None else "once for this installation"
 
 
 def _mark(name: str) -> Path | None:
@@ -128,13 +139,19 @@ def first_call(name: str, what: str) -> Iterator[None]:
     if mark is not None and mark.exists():
         yield
         return
-    print(f"torchfilm: compiling {what}, once for this installation", file=sys.stderr)
+    remedy = (
+        f", since it cannot be kept in {_wanted_folder()}: set XDG_CACHE_HOME to a folder that can"
+        " be written"
+    )
+    why = remedy if FOLDER is None else ""
+    print(f"torchfilm: compiling {what}, {HOW_OFTEN}{why}", file=sys.stderr)
     begin, before = time.perf_counter(), _spent[0]
     with _no_garbage_collected():
         yield
     _spent[0] = before + time.perf_counter() - begin  # with what was compiled inside
     if mark is not None:
-        mark.touch()
+        with suppress(OSError):  # a full disk: it is compiled again
+            mark.touch()
 
 
 @contextmanager
@@ -156,15 +173,43 @@ def _alone(name: str) -> Iterator[None]:
         yield
 
 
-def _keep_alone(made: Any) -> None:
-    """Keep what is compiled of this function while no other process does."""
-    save = made._cache.save_overload
+@cache
+def _not_kept(why: str) -> None:
+    """Say once that compiled code could not be kept."""
+    print(
+        f"torchfilm: could not keep what was compiled in {FOLDER}: {why}. It will be compiled again"
+        " in the next process. Free some space there, or set XDG_CACHE_HOME to another folder.",
+        file=sys.stderr,
+    )
+
+
+def _keep_safely(made: Any) -> None:
+    """Keep what is compiled of this function while no other process does. What cannot be kept is
+    said; what cannot be read, as after a crash, is compiled again."""
+    kept = made._cache
+    save, load = kept.save_overload, kept.load_overload
 
     def save_alone(*given: object) -> None:
-        with _alone(made.py_func.__name__):
-            save(*given)
+        try:
+            with _alone(made.py_func.__name__):
+                save(*given)
+        except OSError as error:
+            _not_kept(str(error))
 
-    made._cache.save_overload = save_alone
+    def load_what_can_be_read(*given: object) -> object:
+        try:
+            return load(*given)
+        except Exception:  # whatever the bytes of a damaged file make of pickle
+            _forget(kept)
+            return None
+
+    kept.save_overload, kept.load_overload = save_alone, load_what_can_be_read
+
+
+def _forget(kept: Any) -> None:
+    """Remove what is kept of a function."""
+    with suppress(OSError):
+        kept.flush()
 
 
 @contextmanager
@@ -251,7 +296,7 @@ def kernel(
     if not entry and isinstance(made, CPUDispatcher):
         made.__class__ = _Inner
     if kept and entry:
-        _keep_alone(made)
+        _keep_safely(made)
     return made
 
 
@@ -285,5 +330,13 @@ def native(signature, function):
     are."""
     compile_for: Any = numba.cfunc
     name = function.__qualname__.replace("<locals>.", "")
+    make = partial(compile_for, signature, nopython=True, error_model="numpy")
     with _kept_in_folder() as kept, _alone(name):
-        return compile_for(signature, nopython=True, cache=kept, error_model="numpy")(function)
+        if kept:
+            try:
+                return make(cache=True)(function)
+            except OSError as error:
+                _not_kept(str(error))
+            except UNREADABLE:
+                _forget(FunctionCache(function))
+        return make(cache=False)(function)
