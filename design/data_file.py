@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,8 @@ import torch
 import torchfilm as tf
 from design.parameters import Value
 
+SPARE_BYTES = 1 << 18  # of a file that grows by a generation
+
 
 @contextmanager
 def replacing(
@@ -24,6 +27,14 @@ def replacing(
     most what is being written. about: plain data; kept: what the older file holds, for the message.
     Raises SimulationError where the file cannot be written."""
     beside = path.with_name(path.name + ".new")
+    # a disk that fills while HDF5 writes may end the process
+    needed = (path.stat().st_size if path.exists() else 0) + SPARE_BYTES
+    free = shutil.disk_usage(path.parent).free
+    if free < needed:
+        raise tf.SimulationError(
+            f"no room to write {path}: {free} bytes are free in {path.parent.resolve()}, and it may"
+            f" need {needed}. Free some space. The file keeps the {kept}."
+        )
     try:
         with h5py.File(beside, "w") as file:
             file.attrs.update(
@@ -38,8 +49,16 @@ def replacing(
             yield file
         os.replace(beside, path)
     except OSError as error:
+        locked = isinstance(error, BlockingIOError)
+        if not locked:
+            beside.unlink(missing_ok=True)
+        why = (
+            "Another process writes it: give each a file of its own."
+            if locked
+            else ("Is the disk full?")
+        )
         raise tf.SimulationError(
-            f"could not write {path}: {error}. Is the disk full? The file keeps the {kept}."
+            f"could not write {path}: {error}. {why} The file keeps the {kept}."
         ) from error
 
 

@@ -24,8 +24,10 @@ def scene(rate=1.0, longest=4.0):
 """
 
 
-def shell(*arguments: object, folder: Path, **options) -> subprocess.CompletedProcess:
-    """The command as a user types it."""
+def shell(
+    *arguments: object, folder: Path, environment: dict[str, str] | None = None, **options
+) -> subprocess.CompletedProcess:
+    """The command as a user types it. environment: variables to add."""
     command = [sys.executable, "-m", "torchfilm.cli.main", *map(str, arguments)]
     return subprocess.run(
         command,
@@ -33,7 +35,7 @@ def shell(*arguments: object, folder: Path, **options) -> subprocess.CompletedPr
         capture_output=True,
         text=True,
         timeout=600,
-        env=ENVIRONMENT,
+        env=ENVIRONMENT | (environment or {}),
         check=False,
         **options,
     )

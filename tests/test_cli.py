@@ -287,10 +287,15 @@ def test_resume_of_a_run_that_is_at_its_end_is_no_error(command):
 
 def test_resume_to_fewer_cells_than_there_are_says_so(command, capsys):
     command("run", "microcolony", "--cells", 4, "--out", "a.h5", "--no-picture")
-    command("resume", "a.h5", "--cells", 3, "--no-picture")
-    assert (
-        "note: every colony has 4 cells or more already: nothing to do" in capsys.readouterr().out
-    )
+    inode = Path("a.h5").stat().st_ino
+    for end, why in (
+        (("--cells", 3), "every colony has 4 cells or more already"),
+        (("--until", 0.1), "the run is at 1."),
+    ):
+        command("resume", "a.h5", *end, "--no-picture")
+        said = capsys.readouterr().out
+        assert f"note: {why}" in said and "nothing to do" in said
+    assert Path("a.h5").stat().st_ino == inode  # not written again
 
 
 def test_as_many_colonies_as_a_parameter_has_values(command):
@@ -325,10 +330,10 @@ def started(folder: Path, results: str, *arguments: str) -> subprocess.Popen:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("attempt", range(3))
-def test_interrupted_from_the_keyboard(tmp_path, attempt):
-    """Ctrl-C at whatever moment: it stops, with a word instead of a traceback, leaves a whole file,
-    and resume goes on.
+@pytest.mark.parametrize(("number", "attempt"), [("SIGINT", 0), ("SIGINT", 1), ("SIGTERM", 2)])
+def test_interrupted(tmp_path, number, attempt):
+    """Ctrl-C or a scheduler's SIGTERM at whatever moment: it stops, with a word instead of a
+    traceback, leaves a whole file, and resume goes on.
 
     Several times, because an interrupt that falls into a callback of the interpreter is easily
     swallowed there.
@@ -336,11 +341,9 @@ def test_interrupted_from_the_keyboard(tmp_path, attempt):
     command = "microcolony --colonies 2 --until 11 --every 1"
     child = started(tmp_path, "microcolony.h5", *command.split())
     time.sleep(0.3 + 0.1 * attempt)
-    child.send_signal(signal.SIGINT)
+    child.send_signal(signal.Signals[number])
     _, errors = child.communicate(timeout=600)
-    assert child.returncode not in (0, -signal.SIGINT), (
-        f"the run went on to its end, or died of the signal: {errors[-300:]}"
-    )
+    assert child.returncode == 128 + signal.Signals[number], errors[-300:]
     assert "Traceback" not in errors and "resume" in errors, errors
     with tf.Results(tmp_path / "microcolony.h5") as results:
         last = int(results.steps[-1])

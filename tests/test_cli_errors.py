@@ -113,7 +113,7 @@ ERRORS = {
     "run microcolony --out good.h5": (r"--out = 'good\.h5'", r"--overwrite.*resume good\.h5"),
     "run microcolony --out text.csv/a.h5 --until 1": (r"text\.csv", ""),
     "resume good.h5": ("--cells", "--until"),
-    "resume good.h5 --until 0.1": ("until", r"0\.1"),
+    "resume good.h5 --until -1": ("until", r"-1"),
     "info missing.h5": (r"missing\.h5", "No such file"),
     "info microcolony --set rtol=1": ("rtol", "It has: dim", "accuracy setting"),
     "resume missing.h5 --until 1": (r"missing\.h5", "No such file"),

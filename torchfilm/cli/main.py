@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import os
+import signal
 import sys
 import warnings
 from typing import Any
@@ -38,6 +40,9 @@ COMMANDS: dict[str, type[Any]] = {
 
 def main() -> None:
     """Entry point of the `torchfilm` command."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal that knows no µ
     try:
         try:
             _command()
@@ -66,14 +71,18 @@ def _command() -> None:
         with once():
             command()
     except (InputError, SimulationError) as error:
-        raise SystemExit(f"torchfilm: {error}") from None
-    except KeyboardInterrupt:
+        words = str(error).replace('on_failure="drop"', "--on-failure drop")
+        raise SystemExit(f"torchfilm: {words}") from None
+    except KeyboardInterrupt as stop:
         safe = (
             "; the recorded frames are safe, `torchfilm resume` resumes the run"
             if isinstance(command, (Run, Resume))
             else ""
         )
-        raise SystemExit(f"stopped{safe}.") from None
+        print(f"stopped{safe}.", file=sys.stderr)
+        # as shells count processes that a signal has ended
+        number = stop.args[0] if stop.args and isinstance(stop.args[0], int) else signal.SIGINT
+        raise SystemExit(128 + number) from None
     finally:
         warnings.formatwarning = line_format
 

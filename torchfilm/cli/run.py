@@ -8,7 +8,7 @@ import time
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 import tyro
@@ -79,6 +79,8 @@ class Run:
     """Results file; by default SCENE.h5 in this folder, or NAME_run.h5 for a saved design."""
     every: int = 10
     """Record every this many steps."""
+    on_failure: Literal["raise", "drop"] = "raise"
+    """What a colony that fails does: raise ends the run; drop removes its cells and continues."""
     overwrite: bool = False
     """Replace the results file, and the picture beside it, if they exist. The old results stay
     until the first frame of the new ones is on the disk."""
@@ -131,6 +133,7 @@ class Run:
             watch=self.watch,
             picture=self.picture,
             colour=colour,
+            on_failure=self.on_failure,
             # sooner than simulate warns of a run that does not end
             full=Standstill(DEFAULT_CELLS, STILL - LOOK) if unasked else None,
         )
@@ -179,6 +182,8 @@ class Resume:
     """Reload the rules file when it is edited during the run."""
     picture: bool = True
     """Draw the last frame beside the results."""
+    on_failure: Literal["raise", "drop"] = "raise"
+    """What a colony that fails does: raise ends the run; drop removes its cells and continues."""
     changed: bool = False
     """Resume although the scene differs from the recorded one."""
 
@@ -200,9 +205,11 @@ class Resume:
             dt, every = float(results.attributes["dt"]), int(results.attributes["every"])
         if self.picture:
             own_picture(self.file)
-        least = int(state.counts.min())
-        if self.cells is not None and least >= self.cells:
-            print(f"note: every colony has {least} cells or more already: nothing to do")
+        if (why := self._why_at_end(state)) is not None:
+            print(f"note: {why}: nothing to do")
+            if self.picture and state.cells:
+                print(f"picture  {pictures.show(self.file).save(own_picture(self.file))}")
+            return
         use_threads(self.threads, state.colonies)
         recorder = Recorder(self.file, scene, every=every, append=True, changed=self.changed)
         go(
@@ -214,7 +221,17 @@ class Resume:
             dt=dt,
             watch=self.watch,
             picture=self.picture,
+            on_failure=self.on_failure,
         )
+
+    def _why_at_end(self, state: State) -> str | None:
+        """Why the run has got to its end already, or None."""
+        least = int(state.counts.min())
+        if self.cells is not None and least >= self.cells:
+            return f"every colony has {least} cells or more already"
+        if self.until is not None and checks.number("--until", self.until, least=0.0) <= state.time:
+            return f"the run is at {state.time:g} h already"
+        return None
 
 
 def go(
@@ -228,6 +245,7 @@ def go(
     watch: bool,
     picture: bool,
     colour: str | None = None,
+    on_failure: str = "raise",
     full: Standstill | None = None,
 ) -> None:
     """Run with a progress bar; then print where the results are, and a summary. full: for a run
@@ -242,7 +260,6 @@ def go(
     for reload in reloads:
         reload.watching = watch
     timings, begun = Timings(), time.perf_counter()
-    interrupted = catch_interrupt()
     state = start
     run = simulate(
         model,
@@ -251,16 +268,17 @@ def go(
         cells=cells,
         dt=dt,
         record=recorder,
+        on_failure=on_failure,
         timings=timings,
         progress=None,
     )
-    with closing(run):
+    with Stop() as stop, closing(run):
         for state in run:
             for reload in reloads:
                 while reload.messages:
                     tqdm.write(reload.messages.pop(0))
-            if interrupted.is_set():
-                raise KeyboardInterrupt
+            if stop.signal:
+                raise KeyboardInterrupt(stop.signal)
             if full is not None and state.step % LOOK == 0:
                 still = full(state)
                 ended = still | (state.counts >= full.cells) | (state.counts == 0)
@@ -279,15 +297,23 @@ def go(
     print(summary_table(model.scene, state, timings, seconds))
 
 
-def catch_interrupt() -> threading.Event:
-    """Ctrl-C sets the event, which the loop reads between two steps. An exception at any other
-    place may be swallowed, or interrupt the writing of a frame. A second Ctrl-C raises at once."""
-    event = threading.Event()
+class Stop:
+    """Ctrl-C, or a scheduler's SIGTERM, sets `signal`, which the loop reads between two steps. An
+    exception at any other place may be swallowed, or interrupt the writing of a frame. A second
+    Ctrl-C raises at once, a second SIGTERM ends the process."""
 
-    def note(*_: object) -> None:
-        event.set()
+    def __enter__(self) -> Stop:
+        self.signal, self._before = 0, {}
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, _: object) -> None:
+        self.signal = number
         signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, note)
-    return event
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from torchfilm.io.room import why_not_written
 from torchfilm.tools import checks
 from torchfilm.tools.checks import SimulationError
 
@@ -45,7 +46,8 @@ def written_whole(path: Path) -> Iterator[Path]:
         yield beside
         os.replace(beside, path)
     except OSError as error:
-        raise SimulationError(f"could not write {path}: {error}. Is the disk full?") from error
+        why = why_not_written(error)
+        raise SimulationError(f"could not write {path}: {error}. {why}") from error
     finally:
         beside.unlink(missing_ok=True)
 

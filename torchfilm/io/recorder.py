@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-import shutil
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ from torchfilm.io.layout import (
 from torchfilm.io.parameters import write_parameters
 from torchfilm.io.reading import committed, inode_of_open
 from torchfilm.io.results import Results
+from torchfilm.io.room import SPARE_BYTES, check_room, free_bytes, why_not_written
 from torchfilm.model import Model
 from torchfilm.scene import Scene
 from torchfilm.state import FATES, State
@@ -42,14 +43,8 @@ from torchfilm.tools import checks
 from torchfilm.tools.checks import SimulationError
 from torchfilm.version import __version__
 
-try:
-    import resource
-except ImportError:  # not on Windows
-    resource = None  # type: ignore[assignment]
-
 # Suffixes of formats that a run might be thought to write: such a name would mislead.
 OF_OTHERS = (".csv", ".tsv", ".json", ".txt", ".xml")
-SPARE_BYTES = 65536  # that HDF5 may need in addition to the arrays of a frame
 
 
 class Recorder(metaclass=checks.KnownKeywords):
@@ -156,35 +151,48 @@ class Recorder(metaclass=checks.KnownKeywords):
 
     def _open(self, state: State) -> None:
         """Make the new file, complete with a frame, under another name; then put it in place."""
-        if not self.append and not self.overwrite and self.path.exists():
+        self._check_still_free()
+        try:
+            with ExitStack() as hold:
+                if self.append:
+                    self._resume(state, hold)
+                else:
+                    self._create(state, hold)
+                assert self.file is not None
+                self.file = replacing.put_in_place(self.file, self.source, self.target)
+        except BaseException:
+            mine = self.file is not None
+            self._drop()
+            if mine:  # and not another process's
+                self.source.unlink(missing_ok=True)
+            raise
+        self.tables.clear()  # of the file as it was opened before, where it was opened again
+
+    def _check_still_free(self) -> None:
+        """Raise InputError where a file has come to the path, or another process writes it."""
+        if self.append or not self.path.exists():
+            return
+        if not self.overwrite:
             raise checks.input_error(
                 "record",
                 str(self.path),
                 "a path where there is no file yet",
                 "A Recorder writes one run; make another for the next.",
             )
-        try:
-            if self.append:
-                self._resume(state)
-            else:
-                self._create(state)
-            assert self.file is not None
-            self.file = replacing.put_in_place(self.file, self.source, self.target)
-        except BaseException:
-            self._drop()
-            self.source.unlink(missing_ok=True)
-            raise
-        self.tables.clear()  # of the file as it was opened before, where it was opened again
+        replacing.check_replaceable(self.path)
 
-    def _create(self, state: State) -> None:
+    def _create(self, state: State, hold: ExitStack) -> None:
         """A new file with the first frame."""
         self.first_step = state.step
         self.file = replacing.create_file(self.source)
+        # again: nobody else can put a file in place while this one is open beside it
+        self._check_still_free()
         for name, value in self._attributes(state).items():
             self.file.attrs[name] = value
         create_tables(self.file, state)
         write_parameters(self.file, self.scene, state.colony_id, state.step)
         self.file.swmr_mode = True
+        hold.enter_context(replacing.held(self.source))
         self._write(state)
 
     def _attributes(self, state: State) -> dict[str, Any]:
@@ -208,12 +216,17 @@ class Recorder(metaclass=checks.KnownKeywords):
             "internal": json.dumps([f.name for f in state.declared.values() if f.internal]),
         }
 
-    def _resume(self, state: State) -> None:
+    def _resume(self, state: State, hold: ExitStack) -> None:
         """A copy of the file, which ends with this state."""
         with Results(self.path) as kept:
             self._check_resumed(kept, state)
             self.written, self.first_step = int(kept.steps[-1]), int(kept.steps[0])
-        self.file = replacing.copy_committed(self.target, self.source)
+        check_room(
+            self.target, self.target.stat().st_size, f"to resume {self.path}, by a copy of it",
+            "The file is whole. Free some space and resume.",
+        )  # fmt: skip
+        self.file = replacing.create_file(self.source)
+        replacing.copy_committed(self.target, self.file)
         # with `changed`, the scene may be another one
         for name, value in {**scene_attributes(self.scene, self.model), "dt": self.dt}.items():
             self.file.attrs[name] = value
@@ -221,6 +234,7 @@ class Recorder(metaclass=checks.KnownKeywords):
         write_parameters(self.file, *about, changed=self.changed)
         self._add_found(self.file, state)
         self.file.swmr_mode = True
+        hold.enter_context(replacing.held(self.source))
 
     @staticmethod
     def _add_found(file: h5py.File, state: State) -> None:
@@ -284,11 +298,11 @@ class Recorder(metaclass=checks.KnownKeywords):
         self._check_free_bytes(state)
         try:
             self._write_frame(self.file, state)
-        except (OSError, RuntimeError) as error:  # HDF5 reports a failed flush as a RuntimeError
+        except (OSError, RuntimeError, MemoryError) as error:  # a failed flush is a RuntimeError
             self.last = None  # nothing more is written: the file ends with the last complete frame
             raise SimulationError(
-                f"could not write step {state.step} to {self.path}: {error}. Is the disk full?"
-                f" {self._safe}"
+                f"could not write step {state.step} to {self.path}: {error}."
+                f" {why_not_written(error)} {self._safe}"
             ) from error
         self.written = state.step
 
@@ -322,11 +336,8 @@ class Recorder(metaclass=checks.KnownKeywords):
             + sum(c.nbytes for e in (*self.births, *self.ends) for c in e)
             + SPARE_BYTES
         )
-        free = shutil.disk_usage(self.target.parent).free
-        limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0] if resource else -1
-        if limit >= 0:
-            path = self.target if self.written >= 0 else self.source
-            free = min(free, limit - path.stat().st_size)
+        path = self.target if self.written >= 0 else self.source
+        free = free_bytes(self.target.parent, path.stat().st_size)
         if free < needed:
             self.last = None
             raise SimulationError(

@@ -5,17 +5,26 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import h5py
 
 from torchfilm.io.layout import AT_CELLS, CHUNK_ROWS, FORMAT, create_framed, create_table
-from torchfilm.io.reading import committed, open_results
+from torchfilm.io.reading import committed, inode_of_open, open_results
 from torchfilm.tools import checks
+
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None  # type: ignore[assignment]
 
 # POSIX renames an open file, and replaces one that others have open. Windows does neither.
 RENAMES_OPEN_FILES = os.name != "nt"
+JUST_MADE = 0.2  # s, by when a file that a process has created is locked
 CHUNKS_AT_ONCE = 16  # that are copied: whole ones, so that each is compressed once
 
 
@@ -32,12 +41,7 @@ def check_replaceable(path: Path) -> None:
             ours = file.attrs.get("format", FORMAT) == FORMAT
     except OSError as error:
         if isinstance(error, BlockingIOError):  # the lock of HDF5: the other process writes
-            raise checks.input_error(
-                "record",
-                str(path),
-                "a file that no other process writes",
-                "Choose another path, or wait until that process has closed it.",
-            ) from error
+            raise _written_by_another(path) from error
         return  # not HDF5, or results that a killed run left
     if not ours:
         raise checks.input_error(
@@ -48,14 +52,47 @@ def check_replaceable(path: Path) -> None:
         )
 
 
+@contextmanager
+def held(path: Path) -> Iterator[None]:
+    """Other processes find that the file beside the results is being written. HDF5 itself gives its
+    lock back where readers are to follow."""
+    if fcntl is None or not RENAMES_OPEN_FILES:
+        yield
+        return
+    with path.open("rb") as file:
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+
+
+def _is_held(path: Path) -> bool:
+    """Whether a process, also this one, holds or writes the file."""
+    try:
+        with path.open("rb") as file:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # it has gone, or its file system knows no locks
+        pass
+    return False
+
+
 def create_file(path: Path) -> h5py.File:
     """Create a new HDF5 file. A file that an earlier run left at this path is deleted first: its
-    inode may still be open elsewhere, so it is not truncated."""
+    inode may still be open elsewhere, so it is not truncated. Raises InputError where another
+    process is writing it."""
     if path.exists():
+        if time.time() - path.stat().st_mtime < JUST_MADE and not _is_held(path):
+            time.sleep(JUST_MADE)  # from the creation of a file to its lock there are moments
+        if _is_held(path):
+            raise _written_by_another(path)
         check_replaceable(path)
-        path.unlink()
+        path.unlink(missing_ok=True)
     try:
         return h5py.File(path, "x", libver="latest")
+    except FileExistsError as error:
+        raise _written_by_another(path) from error
     except OSError as error:
         path.unlink(missing_ok=True)
         raise checks.input_error(
@@ -66,9 +103,20 @@ def create_file(path: Path) -> h5py.File:
         ) from error
 
 
+def _written_by_another(path: Path) -> checks.InputError:
+    return checks.input_error(
+        "record",
+        str(path).removesuffix(".new"),
+        "a file that no other process writes",
+        "Choose another path, or wait until that process has closed it.",
+    )
+
+
 def put_in_place(file: h5py.File, source: Path, path: Path) -> h5py.File:
     """Write the open file `source` to the disk and rename it to `path`, in one step for all
     readers. Returns the file, open as before. Readers of the old file keep it."""
+    if not source.exists() or source.stat().st_ino != inode_of_open(file):
+        raise _written_by_another(path)  # where no locks are
     if path.exists():
         shutil.copymode(path, source)
     file.flush()
@@ -91,10 +139,9 @@ def put_in_place(file: h5py.File, source: Path, path: Path) -> h5py.File:
     return file
 
 
-def copy_committed(source: Path, target: Path) -> h5py.File:
-    """Copy the complete frames of a results file to a new file, and return that, open for writing.
-    Incomplete frames and the marks that a killed writer leaves are not copied."""
-    out = create_file(target)
+def copy_committed(source: Path, out: h5py.File) -> None:
+    """Copy the complete frames of a results file to a new file, open for writing. Incomplete frames
+    and the marks that a killed writer leaves are not copied."""
     with open_results(source) as file:
         keep = committed(file)
         for name, value in file.attrs.items():
@@ -131,4 +178,3 @@ def copy_committed(source: Path, target: Path) -> h5py.File:
                 copied[start:stop] = item[start:stop]
 
         file.visititems(copy)
-    return out

@@ -25,6 +25,7 @@ import numpy as np
 
 from torchfilm.io.capsule_mesh import Mesh, capsule, centreline
 from torchfilm.io.new_file import check_frames, check_new_file, written_whole
+from torchfilm.io.room import Room
 from torchfilm.io.side_by_side import SideBySide, chosen_colonies, side_by_side
 from torchfilm.io.table import Tables
 from torchfilm.tools import checks
@@ -59,11 +60,11 @@ def write_vtkhdf(
         check_new_file(signals, (SUFFIX,), overwrite, results.path)
     layout = side_by_side(results, places, chosen)
     with written_whole(cells) as beside, h5py.File(beside, "w") as file:
-        _write_cells(file, results, layout, chosen, rods)
+        _write_cells(file, Room(file, cells), results, layout, chosen, rods)
     if not results.signal_names:
         return [cells]
     with written_whole(signals) as beside, h5py.File(beside, "w") as file:
-        _write_signals(file, results, layout, chosen)
+        _write_signals(file, Room(file, signals), results, layout, chosen)
     return [cells, signals]
 
 
@@ -95,7 +96,8 @@ def _growing(group: h5py.Group, name: str, dtype: Any, shape: tuple[int, ...] = 
     )
 
 
-def _add(dataset: h5py.Dataset, rows: np.ndarray) -> None:
+def _add(room: Room, dataset: h5py.Dataset, rows: np.ndarray) -> None:
+    room.claim(rows.nbytes)
     start = len(dataset)
     dataset.resize(start + len(rows), axis=0)
     dataset[start:] = rows
@@ -105,7 +107,7 @@ def _add(dataset: h5py.Dataset, rows: np.ndarray) -> None:
 
 
 def _write_cells(
-    file: h5py.File, results: Results, layout: SideBySide, frames: list[int], rods: str
+    file: h5py.File, room: Room, results: Results, layout: SideBySide, frames: list[int], rods: str
 ) -> None:
     root, steps = _root(file, "PolyData", results, layout, results.times[frames])
     topology, mesh = MESHES[rods][0], MESHES[rods][1]()
@@ -123,19 +125,23 @@ def _write_cells(
         mine = np.isin(found["colony"], layout.places)
         count = int(mine.sum())
         counts.append(count)
-        _add(root["Points"], _points(mesh, layout, {n: x[mine] for n, x in found.items()}, height))
+        _add(
+            room,
+            root["Points"],
+            _points(mesh, layout, {n: x[mine] for n, x in found.items()}, height),
+        )
         if count:
             before = np.arange(count)[:, None]
-            _add(root[topology]["Connectivity"], _flat(mesh.connectivity + before * sizes[0]))
+            _add(room, root[topology]["Connectivity"], _flat(mesh.connectivity + before * sizes[0]))
             ends = _flat(mesh.offsets[1:] + before * sizes[2])
-            _add(root[topology]["Offsets"], np.concatenate([[0], ends]))
+            _add(room, root[topology]["Offsets"], np.concatenate([[0], ends]))
         for name, value in columns.items():
             if name not in LEFT_OUT:
                 column = _plain(value)
                 if name not in data:
                     _growing(data, name, column.dtype)
-                _add(data[name], np.repeat(column, sizes[1]))
-    _add(root[topology]["Offsets"], np.zeros(1))  # for a last frame without cells
+                _add(room, data[name], np.repeat(column, sizes[1]))
+    _add(room, root[topology]["Offsets"], np.zeros(1))  # for a last frame without cells
     _count(root, steps, topology, np.asarray(counts), sizes)
 
 
@@ -201,7 +207,7 @@ def _count(
 
 
 def _write_signals(
-    file: h5py.File, results: Results, layout: SideBySide, frames: list[int]
+    file: h5py.File, room: Room, results: Results, layout: SideBySide, frames: list[int]
 ) -> None:
     root, steps = _root(file, "ImageData", results, layout, results.times[frames])
     assert layout.origin is not None and layout.low is not None and layout.high is not None
@@ -227,7 +233,9 @@ def _write_signals(
         )
         steps[f"PointDataOffsets/{name}"] = np.arange(len(frames))
         for at, k in enumerate(frames):
-            dataset[at] = _covered(results, layout, name, k, shape).reshape(flat)
+            values = _covered(results, layout, name, k, shape).reshape(flat)
+            room.claim(values.nbytes)
+            dataset[at] = values
 
 
 def _covered(

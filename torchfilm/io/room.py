@@ -1,0 +1,64 @@
+"""Room on a disk, looked at before a file is written: a disk that fills while HDF5 writes costs the
+file, and may end the process."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+from pathlib import Path
+
+import h5py
+
+from torchfilm.tools.checks import SimulationError
+
+try:
+    import resource
+except ImportError:  # not on Windows
+    resource = None  # type: ignore[assignment]
+
+SPARE_BYTES = 65536  # that HDF5 may need in addition to the arrays of a frame
+LOCKED = (errno.EAGAIN, errno.EACCES)
+
+
+def free_bytes(folder: Path, written: int = 0) -> int:
+    """How much may be written to a file in this folder, of which there is so much already."""
+    free = shutil.disk_usage(folder).free
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0] if resource else -1
+    return min(free, limit - written) if limit >= 0 else free
+
+
+def check_room(path: Path, needed: int, doing: str, then: str) -> None:
+    """Raise SimulationError unless a file of so many bytes fits beside `path`. doing: what needs
+    it, as "to copy x.h5"; then: what to do, and what is safe."""
+    free = free_bytes(path.parent)
+    if free < needed + SPARE_BYTES:
+        raise SimulationError(
+            f"no room {doing}: {free} bytes are free in {path.parent.resolve()}, and it needs"
+            f" {needed + SPARE_BYTES}. {then}"
+        )
+
+
+class Room:
+    """Room for what is written to an open HDF5 file, which may keep it in memory until it is
+    closed."""
+
+    def __init__(self, file: h5py.File, path: Path):
+        self.file, self.path, self.pending = file, path, 0
+
+    def claim(self, size: int) -> None:
+        """Room for so many bytes more. Raises SimulationError where there is none; then what was
+        written before can be closed."""
+        if free_bytes(self.path.parent) < self.pending + size + SPARE_BYTES:
+            self.file.flush()
+            self.pending = 0
+            check_room(self.path, size, f"to write {self.path}", "Free some space and try again.")
+        self.pending += size
+
+
+def why_not_written(error: BaseException) -> str:
+    """What may be wrong where HDF5 could not write, as a sentence."""
+    if (isinstance(error, OSError) and error.errno in LOCKED) or "unable to lock" in str(error):
+        return "Another process has the file open: give each process a file of its own."
+    if isinstance(error, MemoryError) or "memory" in str(error).lower():
+        return "The process is out of memory: grow fewer colonies at once, or smaller ones."
+    return "Is the disk full?"
