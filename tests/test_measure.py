@@ -132,11 +132,17 @@ def test_neighbours_within_no_such_gap_are_refused(gap):
 
 @pytest.mark.parametrize(
     "name",
-    ["overlaps", "colony_centre", "colony_radius", "depth", "nematic_order", "tilt", "neighbours"],
-)
+    [
+        "overlaps", "colony_centre", "colony_radius", "depth", "nematic_order", "tilt",
+        "neighbours", "wall_forces", "growth_rates",
+    ],
+)  # fmt: skip
 def test_a_measure_of_no_state_is_refused(name):
     measure = getattr(tf.measure, name)
-    more = {"gap": 1.0} if name == "neighbours" else {}
+    more = {
+        "neighbours": {"gap": 1.0}, "wall_forces": {"walls": [], "dt": 1.0},
+        "growth_rates": {"earlier": None},
+    }.get(name, {})  # fmt: skip
     with pytest.raises(tf.InputError, match=rf"{name}\(state\) = None.*a tf\.State"):
         measure(None, **more)
     with pytest.raises(tf.InputError, match=rf"{name} has no parameter 'unheard_of'"):
@@ -148,3 +154,72 @@ def test_walls_that_are_none_are_refused(walls):
     state = tf.Scene(tf.Growth(rate=1.0)).bind().start()
     with pytest.raises(tf.InputError, match=r"overlaps\(walls\) = .*a list of walls"):
         tf.measure.overlaps(state, walls)
+
+
+@pytest.mark.parametrize("length_drag", [10.0, 1e5])
+@pytest.mark.parametrize("stiffness", [None, [1e6, 2e6]])
+def test_a_cell_held_between_walls_pushes_with_its_length_drag(length_drag, stiffness):
+    """Growth that is stopped needs γ · dl/dt, here γ, at both ends; a soft wall of stiffness k
+    yields to it by γ/k, so that growth is stopped after some (γ + k Δl) / k hours."""
+    wall = tf.Box((-1.5, -math.inf), (1.5, math.inf), stiffness=stiffness)
+    mechanics = tf.Mechanics(dim=2, length_drag=length_drag, walls=[wall], tolerance=1e-5)
+    scene = tf.Scene(mechanics, tf.Growth(rate=1.0, law="linear"), dt=0.01)
+    *_, state = tf.simulate(scene, until=2.0, colonies=2)
+    found = tf.measure.wall_forces(state, [wall], 0.01)
+    assert found.facing[:2] == ((1.0, 0.0), (-1.0, 0.0))
+    assert found.force[:, :2].reshape(-1).tolist() == pytest.approx([length_drag] * 4, rel=2e-3)
+
+
+def test_forces_on_walls_balance_in_a_full_box():
+    """At rest nothing is pushed out on either side: those on opposite sides are the same to a few
+    per cent, in each of several colonies."""
+    wall = tf.Box((-6.0, -6.0), (6.0, 6.0))
+    scene = tf.Scene(
+        tf.Mechanics(dim=2, length_drag=1000.0, walls=[wall], tolerance=1e-4),
+        tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)),
+    )  # fmt: skip
+    total, steps = torch.zeros(2, 4, dtype=torch.float64), 0
+    for state in tf.simulate(scene, until=6.0, colonies=2):
+        if state.time > 5.0:
+            total, steps = total + tf.measure.wall_forces(state, [wall], 0.025).force, steps + 1
+    for one, other in ((0, 1), (2, 3)):
+        assert total[:, one].tolist() == pytest.approx(total[:, other].tolist(), rel=0.05)
+    assert bool((total / steps > 1000.0).all())
+
+
+def test_forces_need_one_sided_contacts_and_plain_stiffness():
+    wall = tf.Plane(y=-2.0, facing="+y", stiffness={0: 10.0})
+    both = (tf.Mechanics(dim=2, contacts="bilateral"), tf.Mechanics(dim=2, walls=[wall]))
+    states = [tf.Scene(m).bind().start() for m in both]
+    with pytest.raises(tf.InputError, match="contact_alpha"):
+        tf.measure.wall_forces(states[0], [tf.Plane(y=-2.0, facing="+y")], 0.025)
+    with pytest.raises(tf.InputError, match=r"Plane\.stiffness.*one number"):
+        tf.measure.wall_forces(states[1], [wall], 0.025)
+
+
+def test_growth_rates_are_those_that_pressure_leaves():
+    """A cell that is held between walls does not grow; a free one does at its rate; a cell that was
+    born meanwhile has none."""
+    wall = tf.Box((-1.5, -math.inf), (1.5, math.inf))
+    for walls, wanted in (([], 1.0), ([wall], 0.0)):
+        scene = tf.Scene(tf.Mechanics(dim=2, walls=walls), tf.Growth(rate=1.0))
+        earlier, state = [*tf.simulate(scene, until=0.2, colonies=2)][-2:]
+        assert tf.measure.growth_rates(state, earlier).tolist() == pytest.approx(
+            [wanted] * 2, abs=0.01
+        )
+        assert state.growth_rate.tolist() == [1.0, 1.0]
+    states = [*tf.simulate(tf.scenes.microcolony(), until=1.0)]
+    rates = tf.measure.growth_rates(states[-1], states[0])
+    new = ~torch.isin(states[-1].uid, states[0].uid)
+    assert torch.equal(rates.isnan(), new) and bool(new.any())
+    with pytest.raises(tf.InputError, match="earlier"):
+        tf.measure.growth_rates(states[0], states[-1])
+
+
+def test_upright_cells_have_no_order_in_the_plane():
+    made = lambda axes: tf.Scene(tf.Mechanics()).bind(
+        cells=tf.Cells([[5.0 * k, 0.0, 0.0] for k in range(2)], axes)
+    )
+    order = lambda axes: float(tf.measure.nematic_order(made(axes).start()))
+    assert math.isnan(order([[0.0, 0.0, 1.0]] * 2))
+    assert order([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) == 1.0

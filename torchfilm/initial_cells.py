@@ -421,9 +421,8 @@ def _array(name: str, given: Any, dtype: type) -> np.ndarray:
     bad = np.argwhere(~np.isfinite(values))
     if len(bad):
         at = tuple(int(k) for k in bad[0])
-        raise checks.input_error(
-            f"Cells.{name}[{', '.join(map(str, at))}]", float(values[at]), "finite"
-        )
+        entry = f"[{', '.join(map(str, at))}]" if at else ""
+        raise checks.input_error(f"Cells.{name}{entry}", float(values[at]), "finite")
     return values
 
 

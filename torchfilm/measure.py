@@ -1,4 +1,5 @@
-"""Measures of a state: overlaps, radius, depth and alignment per colony, and neighbour pairs."""
+"""Measures of a state: overlaps, forces on walls, radius, depth and alignment per colony, growth
+rates and neighbour pairs."""
 
 from __future__ import annotations
 
@@ -11,6 +12,8 @@ import torch
 from torch import Tensor
 
 from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.physics.surfaces import FlatSurface
+from torchfilm.physics.wall_contacts import find_wall_contacts
 from torchfilm.physics.walls import Wall, depth_in_walls
 from torchfilm.state import State
 from torchfilm.tools import checks
@@ -50,6 +53,11 @@ class Overlap:
     walls: Tensor
 
 
+def _check_walls(name: str, walls: object) -> None:
+    if not isinstance(walls, (list, tuple)) or not all(isinstance(w, Wall) for w in walls):
+        raise checks.input_error(f"{name}(walls)", walls, "a list of walls, such as [tf.Plane(…)]")
+
+
 @of_a_state
 @one_torch_thread()  # or its others wait in a loop while the next step is computed
 @torch.no_grad()
@@ -58,8 +66,7 @@ def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
 
     An overlap with a wall is measured where the cell is deepest.
     """
-    if not isinstance(walls, (list, tuple)) or not all(isinstance(w, Wall) for w in walls):
-        raise checks.input_error("overlaps(walls)", walls, "a list of walls, such as [tf.Plane(…)]")
+    _check_walls("overlaps", walls)
     axis, length, radius = state.axis.double(), state.length.double(), state.radius.double()
     i, _, gap = gaps_nearby(state.position, axis, length, radius, state.colony, state.colonies)
     depth = -gap
@@ -70,6 +77,84 @@ def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
     placed = (state.position, axis, length, radius, state.own_colony_id)
     at_walls = depth_in_walls(walls, *placed)
     return Overlap(mean, pairs.max(depth[deep]), count, state.groups.max(at_walls))
+
+
+@dataclass(frozen=True)
+class WallForces:
+    """The forces of each colony's cells on walls. force: (B, S) μ·µm²/h, at right angles to each of
+    S surfaces, in the order of the walls: a plane and a sphere have one, a Box two for each axis
+    (low, high), a Channel its two sides and its ends. facing: for each surface the direction
+    towards the cells, as numbers, or None of a sphere."""
+
+    force: Tensor
+    facing: tuple[tuple[float | Tensor, ...] | None, ...]
+
+
+@of_a_state
+@torch.no_grad()
+def wall_forces(state: State, walls: Sequence[Wall], dt: float) -> WallForces:
+    """The forces on walls in the last step, of dt hours, by one-sided contacts.
+
+    A contact pushes with its overlap / (α Δt), on a soft wall with its overlap × stiffness. Divide
+    by the length of a wall (2-D) or its area for the pressure, averaged over steps: one step's is
+    as exact as its solve. walls: those of the scene's Mechanics, with one stiffness or one for each
+    colony.
+    """
+    _check_walls("wall_forces", walls)
+    dt = checks.number("wall_forces(dt)", dt, above=0.0)
+    if "contact_alpha" not in state.fields:
+        raise checks.InputError(
+            "wall_forces: the state has no contact_alpha, the softness of one-sided contacts:"
+            " simulate with tf.Mechanics(contacts='one-sided'), the default."
+        )
+    surfaces = [s for wall in walls for s in wall.surfaces(state.dim)]
+    placed = state.position, state.axis.double(), state.length.double(), state.radius.double()
+    rows = find_wall_contacts(surfaces, *placed, state.own_colony_id)
+    report: Any = state.reports.get("mechanics")
+    steps = 1 if report is None else state.groups.spread(report.substeps.clamp(min=1))
+    soft = state.contact_alpha.double() * (dt / steps)
+    # D² / (α Δt) of each cell at each surface: a stiffness
+    hold = torch.stack([_held(s.wall, soft, state.own_colony_id) for s in surfaces])
+    root = rows.row[:, : state.dim].norm(dim=1)
+    pushed = root * -rows.gap * hold[rows.surface, rows.cell]
+    at = state.colony.index_select(0, rows.cell) * len(surfaces) + rows.surface
+    force = Groups(at, state.colonies * len(surfaces)).sum(pushed.unsqueeze(1))
+    facing = tuple(s.normal if isinstance(s, FlatSurface) else None for s in surfaces)
+    return WallForces(force.view(state.colonies, len(surfaces)), facing)
+
+
+def _held(wall: Wall, soft: Tensor, ids: Tensor) -> Tensor:
+    given = wall.weight if wall.stiffness is None else wall.stiffness
+    if given is None:
+        return 1.0 / soft
+    try:
+        value = torch.as_tensor(given, dtype=torch.float64, device=soft.device)
+    except (TypeError, ValueError, RuntimeError):
+        name = f"{type(wall).__name__}.{'weight' if wall.stiffness is None else 'stiffness'}"
+        rule = "one number or one for each colony, to measure forces"
+        raise checks.input_error(name, given, rule) from None
+    own = value.index_select(0, ids) if value.dim() else value.expand(soft.shape)
+    return own if wall.stiffness is not None else own * own / soft
+
+
+@of_a_state
+@torch.no_grad()
+def growth_rates(state: State, earlier: State) -> Tensor:
+    """How fast each cell has grown since an earlier state of the same run, (N,) 1/h: the change of
+    ln(volume) over time. NaN for cells that were born since. Pressure makes it less than the field
+    `growth_rate`, which is the rate without it."""
+    if not isinstance(earlier, State) or not earlier.time < state.time:
+        shown = f"a state at {earlier.time:g} h" if isinstance(earlier, State) else earlier
+        rule = f"a state of the same run before {state.time:g} h"
+        raise checks.input_error("growth_rates(earlier)", shown, rule)
+    key = lambda s: torch.stack([s.own_colony_id, s.uid], 1)
+    both = torch.cat([key(earlier), key(state)])
+    _, which = torch.unique(both, dim=0, return_inverse=True)
+    before = torch.full((int(which.max()) + 1,) if len(which) else (0,), torch.nan).double()
+    before = before.to(state.device)
+    before[which[: earlier.cells]] = earlier.volume.double()
+    now = state.volume.double()
+    return (now / before[which[earlier.cells :]]).log() / (state.time - earlier.time)
 
 
 @of_a_state
@@ -104,7 +189,11 @@ def depth(state: State) -> Tensor:
 @of_a_state
 @torch.no_grad()
 def nematic_order(state: State) -> Tensor:
-    """Alignment of the axes of each colony in the plane, (B,): 0 for random, 1 for parallel."""
+    """Alignment of the axes of each colony in the x–y plane, (B,): 0 for random, 1 for parallel;
+    NaN without cells.
+
+    In space it is that of their projections, weighted by cos² of the tilt: a cell that stands
+    upright does not count, and where all do it is NaN. `tilt` says how far they stand up."""
     x, y = state.axis[:, 0].double(), state.axis[:, 1].double()
     q = torch.stack([x * x - y * y, 2 * x * y, x * x + y * y], 1)
     total = state.groups.sum(q)

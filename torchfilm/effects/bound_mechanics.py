@@ -20,6 +20,7 @@ from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.tangents import has_tangent, in_forward_mode
+from torchfilm.values import is_drawn, numbers
 
 if TYPE_CHECKING:
     from torchfilm.effects.mechanics import Mechanics
@@ -73,6 +74,30 @@ class BoundMechanics(BoundEffect):
                 "Leave it out, or take dtype=torch.float64.",
             )
 
+    def check_step(self, dt: float, divides: bool) -> None:
+        """Also raise InputError where contacts are so hard that drag, which selects among moves
+        that part cells alike, is lost in rounding."""
+        super().check_step(dt, divides)
+        effect, dtype = self.effect, self.binding.batch.dtype
+        name = "alpha" if effect.stiffness is None else "stiffness"
+        given = getattr(effect, name)
+        if given is None or is_drawn(given):
+            return
+        hardest = numbers(given)
+        alpha = hardest.min() if name == "alpha" else 1.0 / (hardest.max() * dt)
+        viscosity = 1.0 if is_drawn(effect.viscosity) else numbers(effect.viscosity).min()
+        least = torch.finfo(dtype).eps / float(viscosity)
+        if float(alpha) < least:
+            most = 1.0 / (least * dt)
+            bound = f"at least {least:.1g}" if name == "alpha" else f"at most {most:.1g}"
+            raise checks.input_error(
+                f"Mechanics.{name}",
+                float(hardest.min() if name == "alpha" else hardest.max()),
+                f"{bound} in steps of {dt:g} h with {str(dtype)[6:]}: drag would be lost in the"
+                " rounding of such hard contacts",
+                "Leave it out: by default contacts are as hard as they need be.",
+            )
+
     @property
     def by_kernels(self) -> bool:
         return self.compiled
@@ -123,7 +148,9 @@ class BoundMechanics(BoundEffect):
         if "elongation" in fields:
             new["elongation"] = growths
         if one_sided:
-            new["contact_alpha"], new["compression"] = of_contacts
+            found, new["compression"] = of_contacts
+            given = self._given_alpha(state, dt, substeps)
+            new["contact_alpha"] = found if given is None else given
         of_step = MechanicsReport(**vars(report), substeps=substeps)
         return state.with_fields(**new).replace(
             position=x, axis=axes, length=lengths,
@@ -170,6 +197,14 @@ class BoundMechanics(BoundEffect):
             for value in (self.values.alpha, self.values.stiffness)
         )
         return compiled.alpha_arrays(alpha, stiffness, state.radius.dtype)
+
+    def _given_alpha(self, state: State, dt: float, substeps: Tensor) -> Tensor | None:
+        """The α of a step where it, or a stiffness, is given, (N,)."""
+        alpha, stiffness = self.values.alpha, self.values.stiffness
+        if stiffness is not None:
+            own = dt / state.groups.spread(substeps.clamp(min=1)).to(state.radius.dtype)
+            return 1.0 / (stiffness.of_cells(state) * own)
+        return None if alpha is None else alpha.of_cells(state).expand(state.cells).clone()
 
     def _given(self, state: State, dt: float) -> MechanicsInput:
         fields, values = state.fields, self.values

@@ -80,7 +80,9 @@ class Growth(Effect):
         return (
             Field(
                 "growth_rate",
-                "relative growth rate" if self.law != "linear" else "growth of the centreline",
+                "growth rate that the cell has where nothing holds it back"
+                if self.law != "linear"
+                else "growth of the centreline where nothing holds it back",
                 UNITS[self.law],
                 initial=0.0 if self.rate is None else _first_rate,
                 at_division="reset" if drawn and not is_inherited(self.rate) else "copy",

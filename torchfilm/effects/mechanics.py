@@ -17,7 +17,7 @@ from torchfilm.kernels.scheme import OVERLAP, PASSES
 from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
 from torchfilm.parameters import number_range
 from torchfilm.physics.contact_records import ContactSettings
-from torchfilm.physics.initial_overlaps import check_apart, check_room
+from torchfilm.physics.initial_overlaps import check_apart, check_inside, check_room
 from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.surfaces import Surface
 from torchfilm.physics.walls import Wall
@@ -38,10 +38,10 @@ class Mechanics(Effect):
     pressure may hold growth back.
 
     walls: what confines them. dim: 3, or 2 for strict 2-D (four degrees of freedom; nothing can
-    leave the plane). viscosity: μ. length_drag: γ, resistance to a change of length, in units of
-    μ·µm; a state field `drag` multiplies μ cell by cell. With the default, 1e5, colonies grow at
-    their free rate up to ten thousand cells; with 10, the paper's and the default of bilateral
-    contacts, pressure slows them from a hundred cells on.
+    leave the plane). viscosity: μ. length_drag: γ, resistance to a change of length, in the unit
+    of μ × µm; it does not follow `viscosity`. A state field `drag` multiplies μ cell by cell. With
+    the default, 1e5, colonies grow at their free rate up to ten thousand cells; with 10, the
+    paper's and the default of bilateral contacts, pressure slows them from a hundred cells on.
 
     contacts: "one-sided" (default), which only push, or "bilateral", the paper's least squares,
     which also hold an overlapping pair that would part. One-sided contacts hold at any drag;
@@ -224,6 +224,10 @@ class Mechanics(Effect):
                     f" {surface.wall.turn_hint}"
                 )
         check_room(self.surfaces(), state.position, state.radius, state.own_colony_id)
+        check_inside(
+            self.surfaces(), state.position, state.axis, state.length, state.radius,
+            state.own_colony_id, state.uid,
+        )  # fmt: skip
         check_apart(
             state.position,
             state.axis,

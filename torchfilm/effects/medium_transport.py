@@ -184,7 +184,24 @@ class Transport:
     def check(self, name: str, state: State) -> None:
         """Raise InputError for a signal whose rates or method cannot be."""
         assert state.layout is not None
+        self._check_range(name, state.dtype)
         check_method(self._operator(name, state, state.layout.grid.batches[0]), self.medium.method)
+
+    def _check_range(self, name: str, dtype: torch.dtype) -> None:
+        """Raise InputError for a number that would be infinite in the states' type."""
+        signal, most = self.signals[name], torch.finfo(dtype).max
+        given = {n: getattr(signal, n) for n in ("initial", "source", "decay", "reservoir")}
+        for what, value in given.items():
+            if callable(value):
+                continue
+            greatest = float(torch.as_tensor(value, dtype=torch.float64).detach().max())
+            if greatest > most:
+                raise checks.input_error(
+                    f"{what} of the signal {name!r}",
+                    greatest,
+                    f"at most {most:.2g} with {str(dtype)[6:]}",
+                    "Choose another unit of concentration, or dtype=torch.float64.",
+                )
 
     def _prepare(
         self, name: str, state: State, batch: GridBatch, dt: float
@@ -287,6 +304,9 @@ def _on_grid(signal: Signal, name: str, what: str, state: State) -> Tensor:
                 f"It is not at {where} µm and {bad.numel() - 1} more positions.",
             )
         value = found.to(dtype=state.dtype, device=state.device)
+        if not bool(torch.isfinite(value).all()):
+            most = f"at most {torch.finfo(state.dtype).max:.2g} with {str(state.dtype)[6:]}"
+            raise checks.input_error(label, float(found.max()), most)
     else:
         value = _of_colonies(given, state).expand(state.colonies).index_select(0, layout.grid.owner)
     return value if layout.mask is None else value * layout.mask

@@ -1,4 +1,5 @@
-"""The checks that the first cells of a colony lie apart, and have room between walls."""
+"""The checks that the first cells of a colony lie apart, have room between walls, and lie not in
+them."""
 
 from __future__ import annotations
 
@@ -86,3 +87,32 @@ def check_room(surfaces: Sequence[Surface], position: Tensor, radius: Tensor, id
                 " both. Place them farther apart, or give them a stiffness."
             )
             return
+
+
+@torch.no_grad()
+def check_inside(
+    surfaces: Sequence[Surface], position: Tensor, axis: Tensor, length: Tensor, radius: Tensor,
+    ids: Tensor, uid: Tensor,
+) -> None:  # fmt: skip
+    """Warn where a cell lies a radius deep, or deeper, in a hard wall.
+
+    position, axis (N, d); length, radius (N,) µm; ids (N,), of the cells' colonies; uid (N,).
+    """
+    axis, half = axis.double(), 0.5 * length.double()
+    for surface in surfaces:
+        if surface.wall.yields:
+            continue
+        s = surface.deepest(position, axis, half, ids)
+        behind = -surface.gap_of_points(position + s.unsqueeze(1) * axis, ids)[0]
+        deep = torch.nonzero(behind >= -SAME_PLACE * radius).squeeze(1)
+        if not deep.numel():
+            continue
+        k = int(deep[behind[deep].argmax()])
+        warn(
+            f"{type(surface.wall).__name__}: cell {int(uid[k])} of colony {int(ids[k])} starts"
+            f" {float(behind[k] + radius[k]):.3g} µm deep in it (cells at least a radius deep:"
+            f" {deep.numel()}). The first steps move it out, unless another wall is in the way:"
+            " then it stays. Move it, make it shorter, or make room.",
+            category=RuntimeWarning,
+        )
+        return

@@ -30,7 +30,8 @@ def step(given: MechanicsInput) -> MechanicsResult:
     found = (bilateral if bilateral_ones else one_sided).contact_steps(contacts)
     alpha = compression = None
     if given.compression is not None:
-        alpha = given.groups.spread(found.hardness.to(base.dtype))
+        alpha = contacts.alpha  # where it is given
+        alpha = given.groups.spread(found.hardness.to(base.dtype)) if alpha is None else alpha
         compression = (given.compression + (base - found.length)).clamp(min=0.0)
     status = torch.maximum(status, found.status)
     collapsed = _collapsed_steps(given, found)

@@ -286,8 +286,9 @@ def _rule(above: float, least: float, most: float) -> str:
 
 
 def choice(name: str, given: object, allowed: Sequence[object]) -> None:
-    """Raises InputError if the value is not one of `allowed`."""
-    if given not in allowed:
+    """Raises InputError if the value is not one of `allowed`; 2.0 is not 2."""
+    alike = not isinstance(given, (bool, float)) or type(given) in map(type, allowed)
+    if given not in allowed or not alike:
         listed = ", ".join(repr(a) for a in allowed)
         raise input_error(name, given, f"one of {listed}", suggestion(given, allowed))
 

@@ -1,0 +1,92 @@
+"""Contacts whose softness is stated, and first cells that walls leave no room."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+import torch
+from helpers import step
+
+import torchfilm as tf
+
+TWO = tf.Cells([[-1.4, 0.0], [1.4, 0.0]], [[1.0, 0.0]] * 2, length=2.0)
+
+
+def soft(dt: float = 0.01, **given) -> tf.Scene:
+    return tf.Scene(tf.Mechanics(dim=2, **given), founders=TWO, dt=dt)
+
+
+@pytest.mark.parametrize("backend", [None, "torch"])
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [({"stiffness": 500.0}, 0.2), ({"stiffness": [5.0, 50.0]}, [20.0, 2.0]), ({"alpha": 0.1}, 0.1)],
+)
+def test_the_state_holds_the_softness_that_is_stated(backend, given, wanted):
+    """α = 1/(stiffness Δt): the force of a contact is its overlap / (α Δt)."""
+    scene = soft(backend=backend, **given)
+    state = step(scene, scene.bind(2).start(), 0.01)
+    each = torch.as_tensor(wanted).expand(2).repeat_interleave(2)
+    torch.testing.assert_close(state.contact_alpha, each.to(state.dtype))
+
+
+def test_softness_of_sub_steps():
+    """A step with sub-steps holds theirs."""
+    grows = tf.Growth(rate=4.0)
+    scene = tf.Scene(grows, tf.Mechanics(dim=2, stiffness=500.0), founders=TWO)
+    state = step(scene, scene.bind().start(), 0.1)
+    number = int(state.reports["mechanics"].substeps)
+    assert number > 1
+    assert state.contact_alpha.tolist() == pytest.approx([number / 50.0] * 2)
+
+
+@pytest.mark.parametrize("given", [{"stiffness": 1e12}, {"alpha": 1e-30}])
+def test_contacts_too_hard_for_the_numbers_of_a_state(given):
+    """In float32 drag would be lost, and cells turn at random; float64 takes stiffness of 1e12."""
+    (name,) = given
+    with pytest.raises(tf.InputError, match=rf"Mechanics\.{name} = .* with float32: drag"):
+        [*tf.simulate(soft(**given), until=0.02)]
+    if name == "stiffness":
+        assert [*tf.simulate(soft(**given), until=0.02, dtype=torch.float64)]
+
+
+@pytest.mark.parametrize(
+    ("wall", "deep"),
+    [
+        (tf.Sphere((0.0, 0.0), 0.3), "1.2"),
+        (tf.Box((-1.0, -1.0), (1.0, 1.0)), "0.5"),
+        (tf.Plane(x=-0.5, facing="+x"), "1"),
+    ],
+)
+def test_first_cells_that_lie_in_a_wall(wall, deep):
+    scene = tf.Scene(tf.Mechanics(dim=2, walls=[wall]))
+    with pytest.warns(RuntimeWarning, match=rf"cell 0 of colony 0 starts {deep} µm deep in it"):
+        scene.bind()
+
+
+def test_first_cells_that_touch_a_wall_or_lie_in_a_soft_one():
+    for wall in (
+        tf.Box((-1.1, -1.0), (1.1, 1.0)), tf.Box((-1.0, -1.0), (1.0, 1.0), stiffness=100.0)
+    ):  # fmt: skip
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            tf.Scene(tf.Mechanics(dim=2, walls=[wall])).bind()
+
+
+def test_numbers_beyond_those_of_float32():
+    """They would be infinite in the state. In float64 they are numbers."""
+    box = {"box": ((-16, -16), (16, 16)), "spacing": 4.0}
+    for initial in (1e300, lambda at: 1e300 + 0 * at[:, 0]):
+        scene = tf.Scene(tf.Medium(a=tf.Signal(10.0, initial=initial), **box), dim=2)
+        with pytest.raises(tf.InputError, match=r"at most 3\.4e\+38 with float32"):
+            scene.bind().start()
+        assert bool(torch.isfinite(scene.bind(dtype=torch.float64).start().signals["a"]).all())
+
+
+@pytest.mark.parametrize(
+    "make", [lambda d: tf.Scene(tf.Growth(1.0), dim=d), lambda d: tf.Mechanics(dim=d)]
+)
+@pytest.mark.parametrize("dim", [2.0, True, "2"])
+def test_a_dimension_is_a_whole_number(make, dim):
+    with pytest.raises(tf.InputError, match="one of 2, 3"):
+        make(dim)
