@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchfilm.state import State
+from torchfilm.state import CELL, State
 from torchfilm.tools import checks
+from torchfilm.tools.warn_once import warn
 
 
 class RuleError(checks.InputError, AttributeError):
@@ -66,3 +67,39 @@ def broadcast_copy(name: str, tensor: Tensor, dtype: torch.dtype, shape: Sequenc
             f"{name} was set to a tensor of shape {tuple(tensor.shape)}: it must be one value or"
             f" {tuple(shape)}."
         ) from error
+
+
+def warn_of_mixing(rule: str, act: Callable[[State], Mapping[str, Tensor]], state: State) -> None:
+    """Warn where what a rule writes in one colony depends on another of the batch. act: the columns
+    that it writes."""
+    if state.colonies < 2 or not bool((state.counts[:2] > 0).all()):
+        return
+    if names := _mixed(act, state):
+        warn(
+            f"{rule}: what it sets, {names[0]}, depends on the other colonies of the batch: alone a"
+            " colony would have another value. x.max() and x.mean() are over all cells of all"
+            " colonies; cells.colony_max(x) and cells.colony_sum(x) are over each cell's own."
+        )
+
+
+@torch.no_grad()
+def _mixed(act: Callable[[State], Mapping[str, Tensor]], state: State) -> list[str]:
+    """The columns that a rule gives other numbers in a colony alone than beside another one, whose
+    numbers are changed. Nothing where it fails, or where its numbers differ from call to call."""
+    one, two = state.select([0]), state.select([0, 1])
+    mine, cells = two.colony == 0, two.fields
+    other = {
+        n: torch.where(mine.reshape(-1, *[1] * (x.dim() - 1)), x, 0.9 * x)
+        for n, x in cells.items()
+        if x.is_floating_point() and len(x) == two.cells and two.declared[n].scope == CELL
+    }
+    length = torch.where(mine, two.length, 1.3 * two.length)
+    try:
+        alone, again = act(one), act(one)
+        beside = act(two.with_fields(**other).replace(length=length))
+    except Exception:  # numbers that the rule does not expect
+        return []
+    alike = lambda a, b: torch.allclose(a.double(), b.double(), 1e-5, equal_nan=True)
+    if not all(alike(x, again[n]) for n, x in alone.items()):
+        return []
+    return [n for n, x in alone.items() if not alike(x, beside[n][mine])]

@@ -325,3 +325,34 @@ def test_a_colony_counts_the_cells_of_a_condition():
     wrong = tf.Scene(tf.Rules(lambda cells: cells.colony_sum(cells.position)), founders=cells)
     with pytest.raises(tf.InputError, match=r"colony_sum was given a tensor of shape .*\(\d+,\)"):
         wrong.bind().start()
+
+
+@pytest.mark.parametrize("ask", ["max", "mean", "sum"])
+def test_a_rule_that_mixes_colonies_is_told_of(ask):
+    """A colony would grow otherwise beside others. Of one colony nothing is mixed."""
+
+    def all_cells(cells):
+        cells.growth_rate = 0.1 * cells.length / getattr(cells.length, ask)()
+
+    scene = tf.Scene(tf.Rules(all_cells), tf.Growth(), dim=2)
+    with pytest.warns(UserWarning, match=r"all_cells: what it sets, growth_rate, depends on the"):
+        scene.bind(2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene.bind(1)
+
+
+def test_rules_for_each_colony_mix_nothing():
+    """Also with random numbers, flags, and a number that counts the calls."""
+    calls = []
+
+    def own(cells):
+        calls.append(1)
+        share = cells.length / cells.colony_max(cells.length)
+        cells.growth_rate = share * (cells.random() < 0.5)
+        cells.remove_flag = cells.colony_sum(cells.length) > 1000.0
+        cells.called = cells.length * 0 + len(calls)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tf.Scene(tf.Rules(own), tf.Growth(), dim=2).bind(3)

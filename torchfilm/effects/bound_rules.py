@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import Binding, BoundEffect
-from torchfilm.rule_values import RuleError
+from torchfilm.rule_values import RuleError, warn_of_mixing
 from torchfilm.rule_views import KNOWN_FIELDS, MEANS, CellsView, DivisionView
 from torchfilm.state import Births, Field, State
 from torchfilm.tools import checks
@@ -234,7 +234,9 @@ class BoundRules(_BoundRule):
             tried = tried.declare(variable)
         self.traced_reads = tuple(sorted(view._read))
         self.traced_writes = tuple(_written(view, tried))
-        return self.ready(state)
+        state = self.ready(state)
+        warn_of_mixing(_label(update), partial(_columns, update), state)
+        return state
 
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0:
@@ -265,6 +267,13 @@ class BoundRules(_BoundRule):
             gone = None if gone is None else gone & ~kept
         state = state.with_fields(**work)
         return state if gone is None else state.remove(gone, "removed")
+
+
+def _columns(update: Callable[[CellsView], None], state: State) -> dict[str, Tensor]:
+    """What a rule writes in a trial."""
+    view = CellsView(state, TRIAL_STEP, _label(update), declaring=True)
+    _act(update, view)
+    return dict(view._work)
 
 
 def _written(view: CellsView, state: State) -> list[str]:
