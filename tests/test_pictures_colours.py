@@ -323,3 +323,37 @@ def test_what_only_tables_have_is_not_taken_for_a_slip(colour, hint):
     *_, state = tf.simulate(tf.scenes.quorum_sensing(), cells=2)
     with pytest.raises(tf.InputError, match=hint):
         tf.show(state, colour=colour)
+
+
+def test_values_of_ones_own_colour_the_cells(tmp_path):
+    """As tensors, arrays or lists; the first by default. NaN is grey."""
+    *_, state = tf.simulate(tf.scenes.microcolony(), cells=2)
+    level = torch.tensor([0.0, torch.nan])
+    legend = lambda picture: [a.get_title() for a in picture.figure.axes if a.get_title()]
+    for given in (level, level.numpy(), level.tolist()):
+        assert "my level" in legend(tf.show(state, values={"my level": given, "other": given}))
+    chosen = tf.show(state, values={"my level": level, "other": level}, colour="other")
+    assert "other" in legend(chosen) and "my level" not in legend(chosen)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"values": {"a": [1.0]}}, r"values\['a'\].*2 numbers, one a cell"),
+        ({"values": {"a": ["x", "y"]}}, r"values\['a'\].*2 numbers"),
+        ({"values": {"length": [1.0, 2.0]}}, "other names than the cells have"),
+        ({"colour": ["length"]}, "colour = .*the name of one quantity"),
+        ({"background": 3}, "background = 3.*the name of one quantity"),
+    ],
+)
+def test_values_and_names_that_cannot_be_drawn(given, words):
+    *_, state = tf.simulate(tf.scenes.microcolony(), cells=2)
+    with pytest.raises(tf.InputError, match=words):
+        tf.show(state, **given)
+
+
+def test_values_are_of_a_state(tmp_path):
+    for _ in tf.simulate(tf.scenes.microcolony(), until=0.1, record=tmp_path / "a.h5"):
+        pass
+    with pytest.raises(tf.InputError, match="values.*left out for results"):
+        tf.show(tmp_path / "a.h5", values={"a": [1.0]})

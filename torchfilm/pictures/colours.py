@@ -56,6 +56,10 @@ class PlotStyle:
         from matplotlib.colors import is_color_like
 
         checks.choice("view", self.view, tuple(VIEWS))
+        for name in ("colour", "background"):
+            given = getattr(self, name)
+            if given is not None and not isinstance(given, str):
+                raise checks.input_error(name, given, "the name of one quantity, as text")
         if self.channels is not None:
             if self.colour is not None:
                 raise checks.InputError(

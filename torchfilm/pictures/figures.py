@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from torch import Tensor
 
 from torchfilm.io.results import Results
 from torchfilm.pictures.colours import CELLS, Limits, PlotStyle
@@ -32,6 +34,7 @@ def show(
     frame: int = -1,
     scene: Scene | None = None,
     colour: str | None = None,
+    values: Mapping[str, Any] | None = None,
     channels: Mapping[str, str] | None = None,
     background: str | None = None,
     limits: Limits | None = None,
@@ -57,6 +60,10 @@ def show(
     {"cfp": "cyan", "yfp": "yellow"}. background: a signal of the medium, white lowest and black
     highest.
 
+    values: quantities of your own of a state, by name, one number for each cell: `values={"real
+    growth (1/h)": tf.measure.growth_rates(state, earlier)}`. The first colours the cells, unless
+    `colour` says otherwise.
+
     limits: the range of colours by name of a drawn quantity, such as {"yfp": (0, 2)}. A signal with
     the name of a quantity of the cells is "out.NAME". The default is the range of all that is drawn
     in the picture (from 0 for a channel; over the whole box for a signal).
@@ -70,9 +77,14 @@ def show(
     picture. dpi: pixels per inch; a page is 7.2 inches wide.
     """
     figure_class()
+    if values and colour is None and channels is None:
+        colour = next(iter(values))
     style = PlotStyle(colour, channels, background, limits, view, section, whole)
     if isinstance(what, (State, Frame)):
-        shown, heading = _given_frame(what, scene, frame), name_of(scene)
+        shown, heading = _with(values, _given_frame(what, scene, frame)), name_of(scene)
+    elif values:
+        rule = "left out for results: they are of the cells of one state"
+        raise checks.input_error("values", list(values), rule)
     else:
         shown, heading = _recorded_frame(what, scene, frame, background, out)
     return Picture(_one_time(shown, heading, style, colonies, most, title, dpi), out)
@@ -125,6 +137,20 @@ def _given_frame(what: State | Frame, scene: Scene | None, frame: int) -> Frame:
     if isinstance(what, Frame) and scene is not None:
         raise checks.InputError("show got a frame and a scene: a frame has its own walls.")
     return what if isinstance(what, Frame) else frame_of(what, scene)
+
+
+def _with(values: Mapping[str, Any] | None, frame: Frame) -> Frame:
+    """The frame with quantities of the user's own."""
+    count, more = len(frame.cells["colony"]), {}
+    for name, given in (values or {}).items():
+        array = np.asarray(given.detach().cpu() if isinstance(given, Tensor) else given)
+        if array.shape != (count,) or array.dtype.kind not in "fiub":
+            shown = f"{array.dtype} of shape {array.shape}"
+            raise checks.input_error(f"values[{name!r}]", shown, f"{count} numbers, one a cell")
+        if name in frame.cells:
+            raise checks.input_error("values", name, "other names than the cells have already")
+        more[name] = array
+    return replace(frame, cells={**frame.cells, **more})
 
 
 def _recorded_frame(
