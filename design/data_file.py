@@ -36,7 +36,8 @@ def replacing(
             f" need {needed}. Free some space. The file keeps the {kept}."
         )
     try:
-        with h5py.File(beside, "w") as file:
+        _remove_left_over(beside)
+        with h5py.File(beside, "x") as file:
             file.attrs.update(
                 {
                     "format": form,
@@ -48,18 +49,29 @@ def replacing(
             )
             yield file
         os.replace(beside, path)
-    except OSError as error:
-        locked = isinstance(error, BlockingIOError)
-        if not locked:
-            beside.unlink(missing_ok=True)
-        why = (
-            "Another process writes it: give each a file of its own."
-            if locked
-            else ("Is the disk full?")
-        )
+    except (BlockingIOError, FileExistsError) as error:
         raise tf.SimulationError(
-            f"could not write {path}: {error}. {why} The file keeps the {kept}."
+            f"could not write {path}: another process is writing it. Give each process a file of"
+            f" its own. The file keeps the {kept}."
         ) from error
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise tf.SimulationError(
+            f"could not write {path}: {error}. Is the disk full? The file keeps the {kept}."
+        ) from error
+
+
+def _remove_left_over(path: Path) -> None:
+    """Remove a file that a killed process left. Raises BlockingIOError for one that a process is
+    writing: opened to append it keeps what it has."""
+    if not path.exists():
+        return
+    try:
+        h5py.File(path, "a").close()
+    except OSError as error:
+        if isinstance(error, BlockingIOError):
+            raise
+    path.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -45,6 +45,7 @@ ROOMS = {
             "torchfilm.distributions",
             "torchfilm.parameters",
             "torchfilm.effect",
+            "torchfilm.own_step",
             "torchfilm.medium_exchange",
             "torchfilm.rule_values",
             "torchfilm.rule_views",

@@ -355,5 +355,5 @@ def test_values_and_names_that_cannot_be_drawn(given, words):
 def test_values_are_of_a_state(tmp_path):
     for _ in tf.simulate(tf.scenes.microcolony(), until=0.1, record=tmp_path / "a.h5"):
         pass
-    with pytest.raises(tf.InputError, match="values.*left out for results"):
+    with pytest.raises(tf.InputError, match=r"values.*left out for results"):
         tf.show(tmp_path / "a.h5", values={"a": [1.0]})

@@ -243,5 +243,5 @@ def test_an_effect_that_changes_growth_and_does_not_say_so_is_found():
     told, untold = (lit().replace(*lit().effects, Shrinking(says=s)) for s in (True, False))
     replayed_end, full_end = replayed(told, 8)
     same(replayed_end, full_end)
-    with pytest.raises(TypeError, match=r"shrinking changed 'length'.*writes"):
+    with pytest.raises(tf.InputError, match=r"Shrinking\.step changed 'length'.*writes"):
         replayed(untold, 8)

@@ -212,6 +212,9 @@ class Plate(Effect):
     def declares(self, dim):
         return (tf.Field("plate", "per colony", scope="colony", shape=(2,)),)
 
+    def writes(self):
+        return ("plate",)
+
     def step(self, state, dt, values):
         return state.with_fields(plate=state.plate + 1)
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import torch
 
+from torchfilm import own_step
 from torchfilm.parameters import summary
 from torchfilm.resolver import (
     BoundBatch,
@@ -341,11 +342,11 @@ class BoundEffect:
 
     def step(self, state: State, dt: float) -> State:
         """The state after this effect has acted for dt hours."""
+        if not is_own(self.effect):
+            return self.effect.step(state, dt, self.values)
+        before = own_step.seen(state)
         made = self.effect.step(state, dt, self.values)
-        if made is None:
-            name = type(self.effect).__name__
-            raise TypeError(f"{name}.step must return the state; it returned None")
-        return made
+        return own_step.check_step(type(self.effect).__name__, before, made, self.writes())
 
     def run_step(self, state: State, dt: float, timings: Timings | None = None) -> State:
         """As `step`, with torch's `threads`, and timed."""

@@ -137,6 +137,7 @@ def test_a_heap_drives_no_cell_through_a_wall(backend, contacts):
     assert cut > 20, "the heap parts fast"
 
 
+@pytest.mark.filterwarnings("ignore:.*there is room for")
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize(
     "wall",

@@ -10,7 +10,7 @@ from helpers import step
 from scipy.integrate import solve_ivp
 
 import torchfilm as tf
-from torchfilm.signals.exchange import stencil
+from torchfilm.signals.exchange import read, stencil
 from torchfilm.tools.tangents import forward_mode, tangent, with_tangent
 
 DT = 0.05
@@ -48,12 +48,16 @@ def food(state: tf.State) -> float:
     return float(state.fields["out.food"].double().sum()) * state.layout.grid.voxel_volume
 
 
+def stencil_of(state: tf.State):
+    return stencil(state.layout.grid, state.position_3d, state.colony)
+
+
 def exact(state: tf.State, diffusion: float, half: float, growth_yield: float, hours: float):
     """Volumes and field after so many hours, by an implicit integrator at 1e-10, in a box whose
     faces let nothing pass: voxels and volumes in one system of equations."""
     grid = state.layout.grid
     nx, ny, nz = grid.shapes[0]
-    at = stencil(grid, state.position_3d, state.colony)
+    at = stencil_of(state)
     node, weight = at.node.numpy(), at.weight.double().numpy()
     count, step_size = len(state.volume), grid.spacing[0]
 
@@ -150,13 +154,19 @@ def test_fast_diffusion_feeds_a_cell_at_the_law():
 @pytest.mark.parametrize("diffusion", [0.0, 10.0, 1e3, 1e5])
 @pytest.mark.parametrize("half", [1e-3, 0.1])
 @pytest.mark.parametrize("boundary", [None, FED])
-def test_hungry_crowds_converge(diffusion, half, boundary):
+@pytest.mark.parametrize("backend", [None, "torch"])
+def test_hungry_crowds_converge(diffusion, half, boundary, backend):
     """36 cells that would take all there is many times in a step: the solve converges, in less than
-    half of its iterations, and leaves nothing below 0."""
+    half of its iterations, and leaves nothing below 0. What is eaten is what was lost."""
     made = scene(
-        diffusion=diffusion, half=half, growth_yield=1e-3, cells=CROWD, boundary=boundary, depth=1.0
-    )
+        diffusion=diffusion, half=half, growth_yield=1e-3, cells=CROWD, boundary=boundary,
+        depth=1.0, backend=backend,
+    )  # fmt: skip
     state = made.bind().start()
+    if boundary is None:
+        last = advance(made, made.bind(dtype=F64).start(), 2, DT)
+        lost = food(made.bind(dtype=F64).start()) - food(last)
+        assert float(last.food_eaten.sum()) == pytest.approx(lost, rel=1e-8)
     for _ in range(3):
         state = step(made, state, DT)
         note = state.reports["nutrition"]
@@ -242,6 +252,41 @@ def test_a_nutrient_that_is_used_up():
     start = made.bind(dtype=F64).start()
     state = advance(made, start, 60, 0.1)
     assert food(state) < 1e-3 * food(start) and float(state.growth_rate.max()) < 0.05
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("backend", [None, "torch"])
+def test_food_without_limit(dtype, backend):
+    """Where nothing moves, and nobody makes a difference to it, cells grow by the law all the
+    same."""
+    made = scene(diffusion=0.0, growth_yield=1e20, backend=backend)
+    state = step(made, made.bind(dtype=dtype).start(), 0.01)
+    found = read(state.fields["out.food"].double(), stencil_of(state))
+    wanted = found / (0.3 + found)
+    torch.testing.assert_close(state.growth_rate.double(), wanted, rtol=1e-5, atol=0.0)
+
+
+class Decay:
+    """A function of positions that holds a tensor."""
+
+    def __init__(self, rate: torch.Tensor):
+        self.rate = rate
+
+    def __call__(self, at: torch.Tensor) -> torch.Tensor:
+        return self.rate * torch.ones(len(at), dtype=at.dtype)
+
+
+@pytest.mark.parametrize("name", ["decay", "source"])
+def test_two_backward_passes_through_a_function_that_holds_a_tensor(name):
+    rate = torch.tensor(0.5, dtype=F64, requires_grad=True)
+    signal = tf.Signal(30.0, initial=1.0, **{name: Decay(rate)})
+    made = tf.Scene(
+        tf.Monod("food", half=0.3, growth_yield=0.2), tf.Growth(),
+        tf.Medium(food=signal, box=BOX, spacing=4.0), founders=FOUR,
+    )  # fmt: skip
+    first = made.bind(1, dtype=F64).start()
+    slopes = [torch.autograd.grad(step(made, first, DT).volume.sum(), rate)[0] for _ in range(2)]
+    assert torch.equal(*slopes) and float(slopes[0]) != 0
 
 
 def test_explain_says_how_the_nutrient_moves():

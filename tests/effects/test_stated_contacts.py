@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import pytest
@@ -51,26 +52,38 @@ def test_contacts_too_hard_for_the_numbers_of_a_state(given):
 
 
 @pytest.mark.parametrize(
-    ("wall", "deep"),
+    ("wall", "room"),
     [
-        (tf.Sphere((0.0, 0.0), 0.3), "1.2"),
-        (tf.Box((-1.0, -1.0), (1.0, 1.0)), "0.5"),
-        (tf.Plane(x=-0.5, facing="+x"), "1"),
+        (tf.Sphere((0.0, 0.0), 0.3), "1 µm"),
+        (tf.Sphere((0.0, 0.0), 1.4), "2.8 µm"),
+        (tf.Box((-1.0, -1.0), (1.0, 1.0)), "2.41 µm"),  # corner to corner
+        (tf.Channel(2.0, low_end=-1.0, high_end=1.0), "2.41 µm"),
     ],
 )
-def test_first_cells_that_lie_in_a_wall(wall, deep):
+def test_first_cells_that_fit_between_no_walls(wall, room):
     scene = tf.Scene(tf.Mechanics(dim=2, walls=[wall]))
-    with pytest.warns(RuntimeWarning, match=rf"cell 0 of colony 0 starts {deep} µm deep in it"):
+    with pytest.warns(RuntimeWarning, match=rf"is 3 µm long, and there is room for {room}"):
         scene.bind()
 
 
-def test_first_cells_that_touch_a_wall_or_lie_in_a_soft_one():
-    for wall in (
-        tf.Box((-1.1, -1.0), (1.1, 1.0)), tf.Box((-1.0, -1.0), (1.0, 1.0), stiffness=100.0)
-    ):  # fmt: skip
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            tf.Scene(tf.Mechanics(dim=2, walls=[wall])).bind()
+@pytest.mark.parametrize(
+    "wall",
+    [
+        tf.Sphere((0.0, 0.0), 1.5),
+        tf.Sphere((0.0, 0.0), 0.3, stiffness=100.0),
+        tf.Sphere((0.0, 9.0), 0.3, inside=False),
+        tf.Box((-1.3, -1.3), (1.3, 1.3)),
+        tf.Box((-1.0, -1.0), (1.0, 1.0), stiffness=100.0),
+        tf.Box((-1.0, -9.0), (1.0, math.inf)),
+        tf.Channel(2.0, low_end=-1.0),
+        tf.Plane(x=-0.5, facing="+x"),
+    ],
+)
+def test_first_cells_that_fit(wall):
+    """Also those that lie in a wall: the first steps move them out."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tf.Scene(tf.Mechanics(dim=2, walls=[wall])).bind()
 
 
 def test_numbers_beyond_those_of_float32():

@@ -204,7 +204,7 @@ def test_the_view_gives_the_same_states():
 
 @dataclass(frozen=True, eq=False)
 class Undeclared(tf.Effect):
-    """Reads the radius and writes the length, and says so of neither."""
+    """Reads the radius and the length, and says so of neither."""
 
     title = "undeclared"
     stage = 35
@@ -216,11 +216,14 @@ class Undeclared(tf.Effect):
         return ("mark",)
 
     def step(self, state, dt, values):
-        return state.replace(length=state.length * 1.0).with_fields(mark=state.radius + 1.0)
+        return state.with_fields(mark=state.radius + state.length)
 
 
-def test_what_is_not_declared_is_found():
+def test_what_is_read_and_not_declared_is_found(monkeypatch):
+    """What is written and not declared is refused by the step itself, which looks at all there
+    is."""
+    monkeypatch.setattr("torchfilm.own_step.seen", lambda state: {})
     model = tf.Scene(*body(), Undeclared()).bind()
     wrong, _ = undeclared(model, model.start())
-    parts = ("reads length", "reads radius", "writes length")
+    parts = ("reads length", "reads radius")
     assert wrong == [f"undeclared {part}" for part in parts]

@@ -373,6 +373,9 @@ class Partition(tf.Effect):
     stage = 25
     title = "partition"
 
+    def writes(self):
+        return ("amount",)
+
     def step(self, state: tf.State, dt: float, values) -> tf.State:
         amount = state.amount.clone()
         for birth in state.births:

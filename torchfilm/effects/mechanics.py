@@ -17,7 +17,7 @@ from torchfilm.kernels.scheme import OVERLAP, PASSES
 from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
 from torchfilm.parameters import number_range
 from torchfilm.physics.contact_records import ContactSettings
-from torchfilm.physics.initial_overlaps import check_apart, check_inside, check_room
+from torchfilm.physics.initial_overlaps import check_apart, check_fits, check_room
 from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.surfaces import Surface
 from torchfilm.physics.walls import Wall
@@ -224,9 +224,9 @@ class Mechanics(Effect):
                     f" {surface.wall.turn_hint}"
                 )
         check_room(self.surfaces(), state.position, state.radius, state.own_colony_id)
-        check_inside(
-            self.surfaces(), state.position, state.axis, state.length, state.radius,
-            state.own_colony_id, state.uid,
+        check_fits(
+            self.surfaces(), state.position, state.length, state.radius, state.own_colony_id,
+            state.uid,
         )  # fmt: skip
         check_apart(
             state.position,

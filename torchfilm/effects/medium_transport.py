@@ -128,13 +128,17 @@ class Transport:
         assert state.layout is not None
         grid = state.layout.grid
         key = (name, state.dtype, torch.is_grad_enabled())
-        known = {} if self._tracked(name) else self._eaten.setdefault(grid, {})
-        if key not in known:
-            known[key] = [
-                UptakeTransport(self._operator(name, state, b), b.shape, self.compiled)
-                for b in grid.batches
-            ]
-        return known[key]
+        known = self._eaten.setdefault(grid, {})
+        if key in known and not self._tracked(name):
+            return known[key]
+        made = [
+            UptakeTransport(self._operator(name, state, b), b.shape, self.compiled)
+            for b in grid.batches
+        ]
+        # as of `carrier`: one that a gradient passes through serves one backward pass
+        if not tracked(*(x for one in made for x in one.numbers())):
+            known[key] = made
+        return made
 
     def exchanges_per_hour(self, name: str, state: State) -> float:
         """The greatest rate at which a voxel loses a signal that cells take up, 1/h, but for

@@ -160,9 +160,8 @@ class BoundMonod(BoundEffect):
 
     def step(self, state: State, dt: float) -> State:
         parts = self.transport.medium.steps
-        with self.transport.one_step():
-            for done in range(parts):
-                state = self._part(state, dt / parts, done, parts)
+        for done in range(parts):
+            state = self._part(state, dt / parts, done, parts)
         return state
 
     def _part(self, state: State, dt: float, done: int, number: int) -> State:

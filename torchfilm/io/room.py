@@ -4,6 +4,7 @@ file, and may end the process."""
 from __future__ import annotations
 
 import errno
+import os
 import shutil
 from pathlib import Path
 
@@ -27,10 +28,10 @@ def free_bytes(folder: Path, written: int = 0) -> int:
     return min(free, limit - written) if limit >= 0 else free
 
 
-def check_room(path: Path, needed: int, doing: str, then: str) -> None:
-    """Raise SimulationError unless a file of so many bytes fits beside `path`. doing: what needs
-    it, as "to copy x.h5"; then: what to do, and what is safe."""
-    free = free_bytes(path.parent)
+def check_room(path: Path, needed: int, doing: str, then: str, written: int = 0) -> None:
+    """Raise SimulationError unless so many bytes fit beside `path`, in a file that has `written`.
+    doing: what needs them, as "to copy x.h5"; then: what to do, and what is safe."""
+    free = free_bytes(path.parent, written)
     if free < needed + SPARE_BYTES:
         raise SimulationError(
             f"no room {doing}: {free} bytes are free in {path.parent.resolve()}, and it needs"
@@ -48,10 +49,11 @@ class Room:
     def claim(self, size: int) -> None:
         """Room for so many bytes more. Raises SimulationError where there is none; then what was
         written before can be closed."""
-        if free_bytes(self.path.parent) < self.pending + size + SPARE_BYTES:
+        written = lambda: os.fstat(self.file.id.get_vfd_handle()).st_size
+        if free_bytes(self.path.parent, written()) < self.pending + size + SPARE_BYTES:
             self.file.flush()
-            self.pending = 0
-            check_room(self.path, size, f"to write {self.path}", "Free some space and try again.")
+            self.pending, then = 0, "Free some space and try again."
+            check_room(self.path, size, f"to write {self.path}", then, written())
         self.pending += size
 
 

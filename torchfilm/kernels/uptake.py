@@ -10,10 +10,12 @@ import numpy as np
 
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.transport import exchanged
-from torchfilm.kernels.transport_solve import backward_euler
+from torchfilm.kernels.transport_solve import backward_euler, dot, product
 
 # As in `tools.fixed_point`.
 DEPTH, RIDGE, TINY = 3, 1e-12, 1e-300
+# The error of a solve is at most this part of the least half; FINEST: its least relative residual.
+HUNGER, FINEST = 1e-4, 1e-14
 
 
 @kernel
@@ -36,6 +38,8 @@ def poisson(mean, cut, weights, tails):
         used = max(used, k + 1) if weights[k] > 0 else used
     for k in range(used):
         tails[k] *= mean / all_tails if all_tails > 0 else 1.0
+    if not all_tails > 0:  # hardly anything happens
+        tails[0] = mean
     return used
 
 
@@ -95,12 +99,12 @@ def series(u, pad, grid, weights, tails, used, gained, times, end, mean, spare):
 
 
 @kernel
-def carry_once(u, more, dt, pad, operator, room, far, settings):
+def carry_once(u, more, dt, pad, operator, room, far, least, settings):
     """One grid over dt hours with the losses in `room`: its end and mean go to room. Whether the
     solve converged, and whether it was one of backward Euler, which it stays once it is `far`.
 
-    u: (voxels,). more: gain, 1/h, or empty. operator: strides … wraps of one colony, its λ, and
-    whether there is no flow.
+    u: (voxels,). more: gain, 1/h, or empty. least: of `half`. operator: strides … wraps of one
+    colony, its λ, and whether there is no flow.
     """
     strides, stay, ups, downs, wrap_to, wrap_from, wraps, rate, symmetric = operator
     loss, still, x, r, b, final, mean, spare, mixed, weights, tails = room
@@ -119,11 +123,17 @@ def carry_once(u, more, dt, pad, operator, room, far, settings):
         used = poisson(times, cut, weights, tails)
         series(u, pad, grid, weights, tails, used, more / at, times, final, mean, spare)
         return True, far
-    within = max(tolerance, rounding * dt * fastest)
+    # where cells are hungry at little concentration, an error of it counts, too
+    size = np.sqrt(dot(b, b))
+    within = min(tolerance, HUNGER * least / size) if size > 0 else tolerance
+    within = max(within, FINEST, rounding * dt * fastest)
     good = backward_euler(x, b, r, pad, grid, times, within, symmetric, most, spare)
     for i in range(u.size):
+        x[pad + i] = max(x[pad + i], 0.0)
+    product(x, r, pad, grid, times)
+    for i in range(u.size):
         # with its residual the change is what T makes of x: amount is conserved
-        mean[i], final[i] = x[pad + i], max(x[pad + i] + r[i], 0.0)
+        mean[i], final[i] = x[pad + i], max(x[pad + i] + b[i] - r[i], 0.0)
     return good, far
 
 
@@ -198,11 +208,13 @@ def eat_grid(u, more, dt, pad, operator, room, cells, place, found, out, setting
     mean, new, taking = found.copy(), out[0], np.empty(size)
     before, changes = np.empty((2, size)), np.empty((DEPTH, 2, size))
     matrix, right = np.empty((DEPTH, DEPTH)), np.empty(DEPTH)
-    far, good, near, count = False, True, True, 0
+    far, good, near, count, least = False, True, True, 0, np.inf
+    for i in range(first, last):
+        least = min(least, half[i])
     while True:
         put_taking(taking, mean, cells)
         put_losses(room[0], taking, node, weight, start, voxel_volume)
-        good, far = carry_once(u, more, dt, pad, operator, room, far, rest)
+        good, far = carry_once(u, more, dt, pad, operator, room, far, least, rest)
         put_read(new, room[6], node, weight, start)
         done, near = next_guess(
             mean, new, before, changes, matrix, right, half[first:last], fed[first:last], close,

@@ -1,5 +1,4 @@
-"""The checks that the first cells of a colony lie apart, have room between walls, and lie not in
-them."""
+"""The checks that the first cells of a colony lie apart, and have room between walls."""
 
 from __future__ import annotations
 
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.physics.contacts import gaps_nearby
-from torchfilm.physics.surfaces import FlatSurface, Surface
+from torchfilm.physics.surfaces import FlatSurface, RoundSurface, Surface, per_cell
 from torchfilm.tools.warn_once import warn
 
 # Centres nearer than this share of a radius count as one place.
@@ -90,29 +89,39 @@ def check_room(surfaces: Sequence[Surface], position: Tensor, radius: Tensor, id
 
 
 @torch.no_grad()
-def check_inside(
-    surfaces: Sequence[Surface], position: Tensor, axis: Tensor, length: Tensor, radius: Tensor,
-    ids: Tensor, uid: Tensor,
+def check_fits(
+    surfaces: Sequence[Surface], position: Tensor, length: Tensor, radius: Tensor, ids: Tensor,
+    uid: Tensor,
 ) -> None:  # fmt: skip
-    """Warn where a cell lies a radius deep, or deeper, in a hard wall.
+    """Warn where a cell is longer than what a hard box or ball leaves it, however it lies.
 
-    position, axis (N, d); length, radius (N,) µm; ids (N,), of the cells' colonies; uid (N,).
+    position (N, d); length, radius (N,) µm; ids (N,), of the cells' colonies; uid (N,).
     """
-    axis, half = axis.double(), 0.5 * length.double()
+    room: dict[int, list[Tensor]] = {}  # by wall: the squares of what opposite sides leave
+    for one, other in itertools.combinations([s for s in surfaces if not s.wall.yields], 2):
+        if one.wall is not other.wall or not isinstance(one, FlatSurface):
+            continue
+        (near, way), (far, back) = (s.gap_of_points(position, ids) for s in (one, other))
+        if bool(((way * back).sum(0) < -1 + 1e-9).all()):
+            left = (near + far - 2 * radius).clamp(min=0.0)
+            room.setdefault(id(one.wall), []).append(left * left)
+    longest = {
+        k: torch.stack(x).sum(0).sqrt() for k, x in room.items() if len(x) == position.shape[1]
+    }
     for surface in surfaces:
-        if surface.wall.yields:
+        most = longest.get(id(surface.wall))
+        if isinstance(surface, RoundSurface) and surface.inside and not surface.wall.yields:
+            most = 2 * (per_cell(surface.radius, ids, position) - radius)
+        if most is None:
             continue
-        s = surface.deepest(position, axis, half, ids)
-        behind = -surface.gap_of_points(position + s.unsqueeze(1) * axis, ids)[0]
-        deep = torch.nonzero(behind >= -SAME_PLACE * radius).squeeze(1)
-        if not deep.numel():
-            continue
-        k = int(deep[behind[deep].argmax()])
-        warn(
-            f"{type(surface.wall).__name__}: cell {int(uid[k])} of colony {int(ids[k])} starts"
-            f" {float(behind[k] + radius[k]):.3g} µm deep in it (cells at least a radius deep:"
-            f" {deep.numel()}). The first steps move it out, unless another wall is in the way:"
-            " then it stays. Move it, make it shorter, or make room.",
-            category=RuntimeWarning,
-        )
-        return
+        over = torch.nonzero(length > most + 1e-6 * radius).squeeze(1)
+        if over.numel():
+            k = int(over[0])
+            warn(
+                f"{type(surface.wall).__name__}: cell {int(uid[k])} of colony {int(ids[k])} is"
+                f" {float(length[k] + 2 * radius[k]):.3g} µm long, and there is room for"
+                f" {max(0.0, float(most[k])) + 2 * float(radius[k]):.3g} µm: it will lie in the"
+                " wall. Make room, shorten the cell, or give the wall a stiffness.",
+                category=RuntimeWarning,
+            )
+            return

@@ -28,7 +28,7 @@ class FlatSurface:
     def gap_of_points(self, points: Tensor, colony: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (P,) of points (P, d), float64, and the direction to the wall, (d, P)."""
         normal = _vectors(self.normal, colony, points)
-        distance = (points * normal).sum(1) - _per_cell(self.offset, colony, points)
+        distance = (points * normal).sum(1) - per_cell(self.offset, colony, points)
         return distance, (-normal).expand(points.shape).T
 
     def deepest(self, position: Tensor, axis: Tensor, half: Tensor, colony: Tensor) -> Tensor:
@@ -53,7 +53,7 @@ class RoundSurface:
         """As for a flat surface."""
         out = (points - _vectors(self.center, colony, points)).T
         distance = safe_norm(out)
-        radius = _per_cell(self.radius, colony, points)
+        radius = per_cell(self.radius, colony, points)
         # at the exact centre all directions lead equally far to the wall; the first axis is taken
         ahead = torch.zeros_like(out)
         ahead[0] = 1.0
@@ -104,7 +104,7 @@ def as_data(surface: Surface) -> dict[str, Any]:
     }
 
 
-def _per_cell(given: float | Tensor, colony: Tensor, like: Tensor) -> Tensor | float:
+def per_cell(given: float | Tensor, colony: Tensor, like: Tensor) -> Tensor | float:
     """The value of each cell's colony, (P,), or the number itself."""
     if not isinstance(given, Tensor):
         return given
@@ -116,7 +116,7 @@ def _vectors(entries: Vector, colony: Tensor, like: Tensor) -> Tensor:
     """(d,) if one vector holds for all cells, else one per cell, (P, d)."""
     if not any(isinstance(entry, Tensor) for entry in entries):
         return like.new_tensor(entries)
-    found = [_per_cell(entry, colony, like) for entry in entries]
+    found = [per_cell(entry, colony, like) for entry in entries]
     return torch.stack(
         torch.broadcast_tensors(
             *(f if isinstance(f, Tensor) else like.new_tensor(f) for f in found)

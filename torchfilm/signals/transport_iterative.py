@@ -89,13 +89,25 @@ class Unsplit:
 
     def step(self, u: Tensor) -> Tensor:
         """u (B, nx, ny, nz) one step later; NaN in a colony whose solve did not converge."""
-        out, report = self.solve(u)
+        return self.step_and_mean(u)[0]
+
+    def step_and_mean(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """As `step`; and the field by whose exchange u has changed, to rounding."""
+        out, residual, report = self._solve(u)
         # the exact solution of backward Euler has nothing below 0
+        mean = out - residual
         out = out.clamp(min=0.0) if self.theta == 1 else out
-        return torch.where(report.converged.reshape(-1, 1, 1, 1), out, torch.nan)
+        good = report.converged.reshape(-1, 1, 1, 1)
+        out, mean = torch.where(good, out, torch.nan), torch.where(good, mean, torch.nan)
+        return out.to(u.dtype), mean.to(u.dtype)
 
     def solve(self, u: Tensor) -> tuple[Tensor, TransportSolveReport]:
         """u one step later, as far as the solve came, and its report."""
+        out, _, report = self._solve(u)
+        return out.to(u.dtype), report
+
+    def _solve(self, u: Tensor) -> tuple[Tensor, Tensor, TransportSolveReport]:
+        """The solution and what its last correction was, float64, and the report."""
         wide = u.double()
         linear = lambda x: apply(self.operator, x, gain=False)
         left = lambda x: x - self.theta * self.dt * linear(x)
@@ -109,17 +121,19 @@ class Unsplit:
                 still, b, first, self.operator.symmetric, self.tolerance
             )
             x, report = solved(bare(right), bare(wide))
+            x = x.clamp(min=0.0) if self.theta == 1 else x
             # the change is then what T makes of x, which conserves amount to rounding
-            x = x + (bare(right) - still(x))
+            residual = bare(right) - still(x)
+            x = x + residual
             moved = both(right - left(x))[1]
             if moved is not None:  # x' = A⁻¹ (b' − A' x)
                 turned, _ = solved(moved, torch.zeros_like(x))
-                return with_tangent(x, turned).to(u.dtype), report
+                return with_tangent(x, turned), residual, report
         if torch.is_grad_enabled():
             remainder = right - left(x)
             if remainder.requires_grad:
                 x = _KrylovAdjoint.apply(remainder, x, left, self)
-        return x.to(u.dtype), report
+        return x, residual, report
 
 
 class _KrylovAdjoint(torch.autograd.Function):

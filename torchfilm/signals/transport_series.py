@@ -152,5 +152,6 @@ def poisson(mean: np.ndarray, cut: float) -> tuple[np.ndarray, np.ndarray]:
     more = np.concatenate([above[1:], np.zeros((1, mean.size))])
     total = np.cumsum(more[::-1], 0)[-1]
     more = more * np.where(total > 0, mean / np.where(total > 0, total, 1.0), 1.0)
+    more[0] = np.where(total > 0, more[0], mean)  # hardly anything happens
     used = int((found > 0).any(1).nonzero()[0].max()) + 1
     return found[:used], more[:used]

@@ -66,13 +66,12 @@ class UptakeTransport:
         over = rate * dt > EVENTS
         far = over if far is None else far | over
         if bool(far.all()):
-            end = prepare_backward_euler(operator, dt).step(u)
-            return end, end, far
+            return *prepare_backward_euler(operator, dt).step_and_mean(u), far
         end, mean = _series(operator, torch.where(far, torch.inf, rate), dt, u)
         if bool(far.any()):
-            solved = prepare_backward_euler(operator, dt).step(u)
+            solved, by = prepare_backward_euler(operator, dt).step_and_mean(u)
             there = far.reshape(-1, 1, 1, 1)
-            end, mean = torch.where(there, solved, end), torch.where(there, solved, mean)
+            end, mean = torch.where(there, solved, end), torch.where(there, by, mean)
         return end, mean, far
 
 

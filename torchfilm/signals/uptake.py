@@ -148,7 +148,8 @@ def _with_derivative(step: _Step, mean: Tensor, groups: Groups) -> Tensor:
             lambda x: _zero_if_none(both(step(with_tangent(mean, x))[1])[1], x), moved,
             lambda x: size, groups, CLOSE, MOST,
         )  # fmt: skip
-        return with_tangent(mean, turned.x)
+        failed = turned.failed.index_select(0, groups.owner)
+        return with_tangent(mean, torch.where(failed, torch.nan, turned.x))
     change = step(mean)[1] - mean
     return _Adjoint.apply(change, mean, step, groups) if change.requires_grad else mean
 

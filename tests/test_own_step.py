@@ -1,0 +1,73 @@
+"""What a step of an effect of the user's own may do to a state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+import torch
+from helpers import step
+
+import torchfilm as tf
+
+
+@dataclass(frozen=True, eq=False)
+class Mine(tf.Effect):
+    act: Any = None
+    names: tuple[str, ...] = ("growth_rate",)
+
+    stage = 27
+    title = "mine"
+
+    def writes(self):
+        return self.names
+
+    def step(self, state, dt, values):
+        return self.act(state)
+
+
+def run(act, names=("growth_rate",)) -> tf.State:
+    scene = tf.Scene(Mine(act, names), tf.Growth(), dim=2)
+    return step(scene, scene.bind(2).start(), 0.025)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.int64, torch.bool])
+def test_another_type_of_numbers(dtype):
+    wrong = lambda s: s.with_fields(growth_rate=torch.ones(s.cells, dtype=dtype))
+    with pytest.raises(tf.InputError, match=r"Mine\.step gave 'growth_rate' as .* it is float32"):
+        run(wrong)
+
+
+def test_a_change_in_place():
+    """Earlier states have the same tensor."""
+
+    def act(state):
+        state.growth_rate.add_(1.0)
+        return state
+
+    with pytest.raises(tf.InputError, match=r"Mine\.step changed 'growth_rate' in place"):
+        run(act)
+
+
+@pytest.mark.parametrize("names", [(), ("growth_rate",)])
+def test_a_change_that_writes_does_not_name(names):
+    longer = lambda s: s.replace(length=s.length * 1.1)
+    with pytest.raises(tf.InputError, match=r"changed 'length', which its writes\(\) does not"):
+        run(longer, names)
+    again = lambda s: s.replace(length=s.length.clone())  # the same numbers
+    assert run(again, names).length.tolist() == [2.0, 2.0]
+
+
+@pytest.mark.parametrize(("given", "shown"), [(None, "None"), (3, "a int")])
+def test_what_is_no_state(given, shown):
+    with pytest.raises(TypeError, match=f"must return the state; it returned {shown}"):
+        run(lambda s: given)
+
+
+def test_what_it_may_do():
+    """Also remove cells, if it says so."""
+    faster = run(lambda s: s.with_fields(growth_rate=s.growth_rate + 1.0))
+    assert faster.growth_rate.tolist() == [1.0, 1.0]
+    fewer = run(lambda s: s.remove(s.colony == 0, "removed"), ("cells",))
+    assert fewer.counts.tolist() == [0, 1]

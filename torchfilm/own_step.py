@@ -1,0 +1,58 @@
+"""What a step of an effect that the user has written may do to a state."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+from torch import Tensor
+
+from torchfilm.state import State
+from torchfilm.tools import checks
+from torchfilm.tools.hot_reload import unchanged
+
+GEOMETRY = ("position", "axis", "length", "radius")
+
+
+def seen(state: State) -> dict[str, tuple[Tensor, int]]:
+    """What an effect may change, by name, each with how often it was changed in place."""
+    parts = {n: getattr(state, n) for n in GEOMETRY} | dict(state.fields)
+    return {n: (x, x._version) for n, x in parts.items()}
+
+
+def check_step(
+    name: str, before: Mapping[str, tuple[Tensor, int]], after: object, writes: Collection[str]
+) -> State:
+    """The state that an effect's step has made. Raises TypeError where it is none; InputError where
+    it has columns of another type, changed what `writes()` does not name, or changed a tensor in
+    place."""
+    if not isinstance(after, State):
+        raise TypeError(f"{name}.step must return the state; it returned {_shown(after)}")
+    for what, (old, version) in before.items():
+        if old._version != version:
+            raise checks.InputError(
+                f"{name}.step changed {what!r} in place: earlier states share this tensor. Write"
+                f" state.with_fields({what}=…) or state.replace({what}=…) with a new one."
+            )
+        new = getattr(after, what) if what in GEOMETRY else after.fields[what]
+        if new is old:
+            continue
+        if new.dtype != old.dtype:
+            raise checks.InputError(
+                f"{name}.step gave {what!r} as {_type(new)}; it is {_type(old)}: write"
+                f" x.to(state.{what}.dtype)."
+            )
+        same = new.shape == old.shape and unchanged(new, old)
+        if what not in writes and "cells" not in writes and not same:
+            raise checks.InputError(
+                f"{name}.step changed {what!r}, which its writes() does not name: a scene is"
+                " ordered, and growth recorded, by what effects say that they change."
+            )
+    return after
+
+
+def _shown(given: object) -> str:
+    return "None" if given is None else f"a {type(given).__name__}"
+
+
+def _type(x: Tensor) -> str:
+    return str(x.dtype).removeprefix("torch.")
