@@ -107,6 +107,8 @@ class FirstHalf(_MediumPart):
 
     def numerics(self, dt: float, state: State) -> list[str]:
         often = self.transport.in_turns
+        if self.transport.coupled >= {*self.effect.signals}:
+            return ["nothing: nutrition moves what there is"]
         whole = len(often | self.transport.coupled) < len(self.effect.signals)
         first = dt / 2 / self.effect.steps if often else dt / 2
         hours = f"{first:g} h" + (f" or {dt / 2:g} h" if whole and first < dt / 2 else "")

@@ -286,7 +286,8 @@ class Medium(Effect):
         sizes = [h for n, h in zip(shape, spacing, strict=True) if n > 1]
         finest = min(sizes, default=spacing[0])
         strang = "half of transport before the cells, half after (Strang)"
-        lines.append(strang if self.halves else "cells, then transport (Lie)")
+        if len(coupled) < len(self.signals):
+            lines.append(strang if self.halves else "cells, then transport (Lie)")
         if exchanged and self.steps > 1:
             names = ", ".join(sorted(exchanged))
             lines.append(f"{self.steps} turns of cells and transport in a step, for {names}")
