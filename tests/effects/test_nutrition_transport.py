@@ -294,3 +294,35 @@ def test_explain_says_how_the_nutrient_moves():
     said = [str(tf.explain(s)) for s in (slow, fast)]
     assert "by a series, order 2" in said[0] and "by backward Euler, order 1" in said[1]
     assert all("moved by nutrition, together with uptake" in x for x in said)
+
+
+@pytest.mark.parametrize("wanted", [20.0, 40.0])
+def test_how_deep_a_nutrient_reaches_into_a_dense_layer(wanted):
+    """Cells that take q conc/h until nothing is left, fed at one face: the steady concentration is
+    (1 − x/L)² with L = √(2 K s/q), as of oxygen in films, in steps many times longer than the
+    nutrient takes to get there."""
+    rate, diffusion, spacing = 1e-4, 1e6, 2.0
+    where = [[spacing * (i + 0.5), spacing * (j + 0.5)] for i in range(30) for j in range(2)]
+    cells = tf.Cells(where, [[1.0, 0.0]] * len(where), length=0.1)
+    volume = float(tf.Scene(tf.Growth(), founders=cells).bind(dtype=F64).start().volume[0])
+    uptake = 2 * diffusion / wanted**2  # conc/h
+    made = tf.Scene(
+        tf.Monod("food", rate=rate, half=1e-4,
+                 growth_yield=rate * volume / (uptake * spacing**2 * 1.0)),
+        tf.Growth(),
+        tf.Medium(
+            food=tf.Signal(diffusion, initial=1.0), box=((0.0, 0.0), (60.0, 4.0)),
+            spacing=spacing, depth=1.0, boundary=tf.BoundaryConditions(x=(FACE, tf.NoFlux())),
+        ),
+        founders=cells,
+    )  # fmt: skip
+    state = advance(made, made.bind(dtype=F64).start(), 4, 0.1)
+    found = state.fields["out.food"].view(30, 2)[:, 0]
+    at = spacing * (torch.arange(30, dtype=F64) + 0.5)
+    theory = (1 - at / wanted).clamp(min=0.0) ** 2
+    # voxels are a tenth or a twentieth of L wide
+    assert float((found - theory).abs().max()) < 0.2 * spacing / wanted
+    fed = at < wanted - 2 * spacing
+    growth = state.growth_rate.view(30, 2)[:, 0]
+    assert float(growth[fed].min()) > 0.9 * rate
+    assert float(growth[at > wanted + 2 * spacing].max()) < 0.1 * rate
