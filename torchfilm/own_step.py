@@ -41,8 +41,9 @@ def check_step(
                 f"{name}.step gave {what!r} as {_type(new)}; it is {_type(old)}: write"
                 f" x.to(state.{what}.dtype)."
             )
-        same = new.shape == old.shape and unchanged(new, old)
-        if what not in writes and "cells" not in writes and not same:
+        if what in writes or "cells" in writes:
+            continue
+        if new.shape != old.shape or not unchanged(new, old):
             raise checks.InputError(
                 f"{name}.step changed {what!r}, which its writes() does not name: a scene is"
                 " ordered, and growth recorded, by what effects say that they change."
