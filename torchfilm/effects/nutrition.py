@@ -71,7 +71,6 @@ class Monod(Effect):
 
     stage = NUTRITION
     title = "nutrition"
-    by_kernels = True
     may_repeat = False
 
     def declares(self, dim: int) -> tuple[Field, ...]:

@@ -199,13 +199,13 @@ def next_guess(mean, new, before, changes, matrix, right, half, fed, close, done
 
 @kernel
 def eat_grid(u, more, dt, pad, operator, room, cells, place, found, out, settings):
-    """One grid over dt hours. out: (2, cells), what they found and took. The iterations, whether
-    they failed, and whether the grid has numbers."""
+    """One grid over dt hours. out: (cells,), what they took. The iterations, whether they
+    failed, and whether the grid has numbers."""
     first, fed, volume, greatest, half, gain, _ = cells
     node, weight, start, voxel_volume = place
     close, most, rest = settings
     size, last = found.size, first + found.size
-    mean, new, taking = found.copy(), out[0], np.empty(size)
+    mean, new, taking = found.copy(), np.empty(size), np.empty(size)
     before, changes = np.empty((2, size)), np.empty((DEPTH, 2, size))
     matrix, right = np.empty((DEPTH, DEPTH)), np.empty(DEPTH)
     far, good, near, count, least = False, True, True, 0, np.inf
@@ -226,7 +226,7 @@ def eat_grid(u, more, dt, pad, operator, room, cells, place, found, out, setting
     for i in range(size):
         k = first + i
         grown = np.expm1(greatest[k] * found[i] / (half[k] + found[i]) * dt)
-        out[1, i] = taking[i] * new[i] * dt if fed[k] else volume[k] / gain[k] * grown
+        out[i] = taking[i] * new[i] * dt if fed[k] else volume[k] / gain[k] * grown
     return count, not (near and good), good
 
 
@@ -234,10 +234,10 @@ def eat_grid(u, more, dt, pad, operator, room, cells, place, found, out, setting
 def eat(
     begin, end, starts, colonies, ends, strides, stay, ups, downs, wrap_to, wrap_from, wraps, rate,
     symmetric, gained, node, weight, fed, volume, greatest, half, gain, found, voxel_volume, dt,
-    settings, values, out, of_cells, iterations, failed,
+    settings, values, out, amount, iterations, failed,
 ):  # fmt: skip
     """The grids begin … end of one shape after a step of dt hours, from values to out, (voxels,) of
-    all colonies; and what their cells found and took: of_cells (2, N).
+    all colonies; and what their cells took: amount (N,).
 
     colonies: of the grids. ends: where the cells of each colony begin, (B + 1,). strides … wraps:
     as `transport.mix` takes them, without uptake, at λ = rate (b or 1,). gained: 1/h, (b or 1 or 0,
@@ -273,7 +273,7 @@ def eat(
         place = node[first:last], weight[first:last], start, voxel_volume
         iterations[colony], failed[colony], good = eat_grid(
             u, more, dt, pad, operator, room, cells, place, found[first:last],
-            of_cells[:, first:last], settings,
+            amount[first:last], settings,
         )  # fmt: skip
         for i in range(size):
             out[start + i] = room[5][i] if good else np.nan

@@ -70,11 +70,11 @@ def eat(
     eaters: Eaters, grid: Grid, kernels: Sequence[CompiledUptake], field: Tensor, found: Tensor,
     close: float, most: int,
 ) -> tuple[Tensor, ...]:  # fmt: skip
-    """As `uptake.solve`, from the same arguments: end, mean, amount, iterations and failed."""
+    """As `uptake.solve`, from the same arguments: end, amount, iterations and failed."""
     from torchfilm.kernels.uptake import eat as run
 
     f64 = torch.float64
-    end, cells = torch.empty_like(field), field.new_empty(2, len(found), dtype=f64)
+    end, amount = torch.empty_like(field), torch.empty_like(found)
     counted = torch.zeros(eaters.groups.size, dtype=torch.int64)
     failed = torch.zeros(eaters.groups.size, dtype=torch.bool)
     of_cells = (eaters.volume, eaters.greatest, eaters.half, eaters.gain, found)
@@ -91,10 +91,10 @@ def eat(
                 one.rate, one.symmetric, one.gained, node, weight, eaters.fed.numpy(), volume,
                 greatest, half, gain, at_start, eaters.stencil.voxel_volume, eaters.dt,
                 (close, most, numbers),
-                source, end.numpy(), cells.numpy(), counted.numpy(), failed.numpy(),
+                source, end.numpy(), amount.numpy(), counted.numpy(), failed.numpy(),
             )  # fmt: skip
             one.shared(batch.starts.numel(), partial(_run, run, given))
-    return end, *cells, counted, failed
+    return end, amount, counted, failed
 
 
 def _run(kernel: Callable[..., object], given: tuple[object, ...], begin: int, end: int) -> None:

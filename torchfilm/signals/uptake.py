@@ -75,11 +75,10 @@ class Eaters:
 
 @dataclass(frozen=True, eq=False)
 class Taken:
-    """end: (voxels,), float64. mean: (N,), s̄ of each cell. amount: (N,), what it took, conc·µm³,
-    also from a reservoir. iterations: (B,). failed: (B,) bool."""
+    """end: (voxels,). amount: (N,) float64, what each cell took, conc·µm³, also from a reservoir.
+    iterations: (B,). failed: (B,) bool."""
 
     end: Tensor
-    mean: Tensor
     amount: Tensor
     iterations: Tensor
     failed: Tensor
@@ -110,7 +109,7 @@ def solve(
     amount = torch.where(
         eaters.fed, taking * new * eaters.dt, eaters.volume / eaters.gain * eaters.grown(found)
     )
-    return Taken(end, torch.where(eaters.fed, new, found), amount, fixed.iterations, fixed.failed)
+    return Taken(end, amount, fixed.iterations, fixed.failed)
 
 
 class _Step:
