@@ -3,6 +3,7 @@ float64."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -219,3 +220,14 @@ def crowd(rng: np.random.Generator, count: int, dim: int, tilt: float = 0.1) -> 
     )
     shuffled = rng.permutation(count)
     return tf.Cells(position[shuffled], axis[shuffled], rng.uniform(1.7, 2.1, count), 0.5)
+
+
+def in_turns(effect: tf.Effect, **options) -> tf.Effect:
+    """A medium with which circuits take turns; other effects as they are."""
+    if not isinstance(effect, tf.Medium):
+        return effect
+    given = {f.name: getattr(effect, f.name) for f in dataclasses.fields(effect)}
+    signals = given.pop("signals")
+    if len(given["box"][0]) == 2:
+        given["spacing"] = given["spacing"][:2]
+    return tf.Medium(**signals, **given | {"exchange": "turns"} | options)

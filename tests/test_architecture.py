@@ -59,6 +59,7 @@ ROOMS = {
             "torchfilm.model",
             "torchfilm.joined_step",
             "torchfilm.turns",
+            "torchfilm.together",
             "torchfilm.binding_checks",
             "torchfilm.initial_cells",
             "torchfilm.micrographs",
@@ -76,7 +77,7 @@ ONE_EFFECT = [
     {f"torchfilm.effects.{name}" for name in names.split()}
     for names in (
         "circuit bound_circuit circuit_cells circuit_checks circuit_kernels circuit_report"
-        " circuit_sbml",
+        " circuit_sbml circuit_words",
         "division compiled_division",
         "medium bound_medium medium_transport",
         "rules bound_rules",

@@ -220,7 +220,7 @@ def test_who_computes_contacts_is_who_is_reported(backend, contacts, monkeypatch
 
 
 def test_what_is_exchanged_is_named():
-    assert "exchanges ahl with" in tf.explain(tf.scenes.quorum_sensing(), seconds=0)
+    assert "transport of ahl in one equation" in tf.explain(tf.scenes.quorum_sensing(), seconds=0)
     assert "exchanges" not in tf.explain(tf.scenes.toggle_switch(), seconds=0)
 
 

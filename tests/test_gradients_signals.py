@@ -18,9 +18,17 @@ from helpers import step
 from torch import Tensor
 
 import torchfilm as tf
+from torchfilm import together
 
 DT = 0.05
 BOX = {"box": ((-8.0, -8.0), (8.0, 8.0)), "spacing": 2.0}
+
+
+@pytest.fixture(autouse=True)
+def solved(monkeypatch):
+    """Exchange and transport solved far closer than the circuits' tolerance, which is wide here so
+    that differences see the same steps: or they would see the iteration."""
+    monkeypatch.setattr(together, "PART", 1e-8)
 
 
 def lux(u, s, p, cell):
@@ -98,7 +106,8 @@ def run(scene: tf.Scene, steps: int, colonies: int = 1) -> tf.State:
         state = step(scene, state, DT)
         assert all(bool((r.status == 0).all()) for r in state.reports.values())
         if "circuit" in state.reports and state.cells:
-            turns = max(e.turns for e in model.effects)
+            parts = next(e.steps for e in scene.effects if isinstance(e, tf.Medium))
+            turns = max(parts, *(e.turns for e in model.effects))
             assert int(state.reports["circuit"].steps.max()) == turns, (
                 "the difference would see other steps"
             )
@@ -139,14 +148,16 @@ def test_explicit_methods(method):
 @pytest.mark.parametrize("name", ["diffusion", "decay", "flow", "face"])
 @pytest.mark.parametrize("method", ["implicit", "crank_nicolson", "euler"])
 def test_every_way_of_transport(method, name):
-    check(lambda x: talking(medium={"method": method}, **{name: x}), OPTIONS[name], steps=3)
+    medium = {"method": method, "exchange": "turns"}
+    check(lambda x: talking(medium=medium, **{name: x}), OPTIONS[name], steps=3)
 
 
-@pytest.mark.parametrize("name", ["make", "luxi", "diffusion"])
-def test_in_turns_of_circuits_and_transport(name):
-    check(
-        lambda x: talking(medium={"steps": 3}, **{name: x}), {**CONSTANTS, **OPTIONS}[name], steps=3
-    )
+@pytest.mark.parametrize("exchange", ["turns", "together"])
+@pytest.mark.parametrize("name", ["make", "luxi", "diffusion", "D1", "initial"])
+def test_in_parts_of_a_step(name, exchange):
+    medium = {"steps": 3, "exchange": exchange}
+    at = {**CONSTANTS, **OPTIONS}[name]
+    check(lambda x: talking(medium=medium, **{name: x}), at, steps=3)
 
 
 def test_about_an_obstacle():

@@ -101,7 +101,7 @@ def colony(contacts: str, **more) -> tuple[tf.Effect, ...]:
 
 
 def signalling() -> tf.Scene:
-    scene = tf.scenes.quorum_sensing(steps=1)  # one turn of the circuit
+    scene = tf.scenes.quorum_sensing()
     by_torch = lambda e: replace(e, backend="torch") if isinstance(e, tf.Mechanics) else e
     return scene.replace(*(by_torch(e) for e in scene.effects))
 
@@ -110,11 +110,12 @@ def signalling() -> tf.Scene:
 # steps have one, reads 17 times around two searches, and 24 times in ten rounds of Newton's method:
 # once a round, and once in eight iterations of conjugate gradients. Bilateral ones read 10 times
 # around a search, and 8 to 10 times in two rounds. A step of a circuit's solver reads twice: 45 in
-# 23 steps. One read more in each iteration, or in each step of a solver, would pass these bounds.
+# 23 steps, and again in each of three or four iterations with transport. One read more in each
+# iteration, or in each step of a solver, would pass these bounds.
 SCENES = {
     "free growth": (lambda: tf.Scene(*colony("one-sided"), dt=0.025), 45),
     "bilateral contacts": (lambda: tf.Scene(*colony("bilateral"), dt=0.025), 21),
-    "a circuit with a signal": (signalling, 90),
+    "a circuit with a signal": (signalling, 221),
 }
 
 

@@ -3,11 +3,15 @@ and write, that none is idle or comes too early, and that a run to a number of c
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
+
+import torch
+from torch import Tensor
 
 from torchfilm.effect import BUILT_IN, BoundEffect, Effect, is_own, makes_longer
+from torchfilm.resolver import FirstValue
 from torchfilm.rule_views import KNOWN_FIELDS, MEANS
-from torchfilm.state import OUTSIDE, State
+from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.warn_once import warn
 
@@ -90,6 +94,34 @@ def warn_of_idle(effects: Sequence[BoundEffect], state: State) -> None:
         for name, text in bound.effect.idle_without(state).items():
             if not _sets(effects, name, bound):
                 warn(text)
+
+
+def warn_of_kept(effects: Sequence[BoundEffect], state: State, own: Container[str]) -> None:
+    """Warn of values of a scene that do nothing for a state that is gone on with: cells got theirs
+    when they came in, keep them and hand them on. own: fields that first cells bring along."""
+    rows = torch.arange(state.cells, device=state.device)
+    for bound in effects if state.cells else ():
+        for field in bound.declares():
+            name = field.name
+            kept = field.scope == CELL and field.at_division == "copy" and name in state.fields
+            if not kept or name in own or not isinstance(field.initial, FirstValue):
+                continue
+            if name in bound.writes() or _sets(effects, name, bound):
+                continue
+            now, given = state.fields[name].detach(), field.initial(state, rows).detach()
+            owner, differ = state.groups.owner, bool((now != given.to(now.dtype)).any())
+            # cells of a colony that differ have been set one by one
+            if differ and bool((state.groups.max(now).index_select(0, owner) == now).all()):
+                warn(
+                    f"This scene gives its first cells {name} = {_few(given)}; those of the state"
+                    f" keep {_few(now)}, and their daughters do. To change it: state ="
+                    f" state.with_fields({name}=torch.full_like(state.{name}, …))."
+                )
+
+
+def _few(values: Tensor) -> str:
+    each = values.unique().tolist()
+    return ", ".join(f"{x:g}" for x in each[:4]) + (", …" if len(each) > 4 else "")
 
 
 def warn_of_early(effects: Sequence[BoundEffect]) -> None:

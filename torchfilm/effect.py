@@ -367,8 +367,14 @@ class BoundEffect:
         return ()
 
     def moves_by(self, transport: Any) -> bool:
-        """Whether it moves the signals that it exchanges itself, by the medium's transport."""
+        """Whether it moves the signals that it exchanges itself, by the medium's transport. None:
+        it is to leave that to the medium."""
         return False
+
+    @property
+    def why_turns(self) -> str:
+        """Why exchange and transport must take turns, in a sentence; empty where they need not."""
+        return ""
 
     @property
     def by_kernels(self) -> bool:

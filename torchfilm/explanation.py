@@ -47,7 +47,8 @@ def explain(
             f"{fixed}, as the scene's parameters or founders have",
             "Leave it out.",
         )
-    model = scene.bind(fixed if fixed > 1 else PROBE_COLONIES, device=device, per_colony=True)
+    count = fixed if fixed > 1 else colonies or PROBE_COLONIES
+    model = scene.bind(count, device=device, per_colony=True)
     state = model.start()
     lines = [scene.headline]
     for effect in model.effects:

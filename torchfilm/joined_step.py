@@ -18,6 +18,7 @@ from torchfilm.effects.bound_mechanics import BoundMechanics
 from torchfilm.effects.growth import Growth, wanted_elongation
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.state import State
+from torchfilm.together import Together
 from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.tangents import tracked
 from torchfilm.tools.timing import Timings
@@ -62,9 +63,11 @@ class JoinedStep:
         return (growth, after) if after.max() < math.inf else None
 
 
-def joined(effects: Sequence[BoundEffect | Turns]) -> list[BoundEffect | JoinedStep | Turns]:
+def joined(
+    effects: Sequence[BoundEffect | Turns | Together],
+) -> list[BoundEffect | JoinedStep | Turns | Together]:
     """The effects, in which growth and contacts right after it are joined where they can be."""
-    found: list[BoundEffect | JoinedStep | Turns] = []
+    found: list[BoundEffect | JoinedStep | Turns | Together] = []
     for effect in effects:
         before = found[-1] if found else None
         if (

@@ -1,5 +1,9 @@
 """Exchange between cells and medium: what cells find outside, and what they give to it in a step.
-One service that circuits and nutrition share."""
+One service that circuits and nutrition share.
+
+Either each cell has a pool in the medium, `MediumExchange`, and transport follows; or the two are
+solved together, and circuits find concentrations that change at given rates, `Ramped`.
+"""
 
 from __future__ import annotations
 
@@ -95,6 +99,11 @@ class MediumExchange:
         """The medium of a state, for these of its signals; None where no signal or no medium is."""
         return MediumExchange(state, signals) if signals and state.layout is not None else None
 
+    @property
+    def first(self) -> Mapping[str, Tensor]:
+        """As the step begins."""
+        return self.found
+
     @cached_property
     def stencil(self) -> Stencil:
         return self._contact.stencil if self._meeting is None else self._meeting.stencil
@@ -110,7 +119,11 @@ class MediumExchange:
             _found_outside(loops, self.stencil.parts)
 
     def give(
-        self, name: str, amount: Tensor, to_reservoir: Tensor | None, rows: Tensor | None = None
+        self,
+        name: str,
+        amount: Tensor | None,
+        to_reservoir: Tensor | None,
+        rows: Tensor | None = None,
     ) -> None:
         """Note what cells give to a signal (negative: take), conc·µm³: to their pools `amount`
         (M,), and to the reservoir. Gifts add up.
@@ -155,3 +168,53 @@ class MediumExchange:
             total = state.groups.sum(amount.unsqueeze(1)).squeeze(1)
             changed[f"{name}_reservoir"] = state.fields[f"{name}_reservoir"] + total
         return state.with_fields(**changed, **more)
+
+
+class Ramped:
+    """The medium about the cells where transport is solved together with them: as `MediumExchange`,
+    but that what cells give is only summed.
+
+    found: concentration of each signal at each cell half way through the step, (N,) by name. ramp:
+    of those that cells exchange, that at first, and the rate at which it changes, conc/h, (N,)
+    each. released: what cells give, less what they take, (N,) conc·µm³ by name.
+    """
+
+    pool = in_reservoir = None
+    in_loops = False
+
+    def __init__(self, found: Mapping[str, Tensor], ramp: Mapping[str, tuple[Tensor, Tensor]]):
+        self.found, self.ramp = found, ramp
+        self.released: dict[str, Tensor] = {}
+
+    @property
+    def first(self) -> Mapping[str, Tensor]:
+        """As the step begins, where that is known."""
+        return {**self.found, **{n: x for n, (x, _) in self.ramp.items()}}
+
+    def take_loops(self) -> list[Loop]:
+        return []
+
+    def find(self) -> None:
+        pass
+
+    def give(
+        self, name: str, amount: Tensor | None, released: Tensor | None, rows: Tensor | None = None
+    ) -> None:
+        """Note what cells release, (M,); as `MediumExchange.give`."""
+        assert released is not None
+        before = self.released.get(name)
+        if rows is not None:
+            start = torch.zeros_like(self.found[name]) if before is None else before
+            self.released[name] = start.index_add(0, rows, released.to(start.dtype))
+        else:
+            self.released[name] = released if before is None else before + released
+
+
+Around = MediumExchange | Ramped
+
+
+def form_of(medium: Around | None) -> str:
+    """How circuits exchange with it: their equations depend on that."""
+    if isinstance(medium, Ramped):
+        return "ramp"
+    return "pool" if medium is None or medium.in_reservoir is None else "reservoir"

@@ -27,11 +27,13 @@ from torchfilm.joined_step import JoinedStep, joined
 from torchfilm.parameters import parameters
 from torchfilm.resolver import BoundBatch
 from torchfilm.state import CELL, PER_CELL, Field, State
+from torchfilm.together import Together
 from torchfilm.tools import checks, displays
 from torchfilm.tools.hashing import digest
 from torchfilm.tools.row_checks import check_declared, check_geometry
 from torchfilm.tools.tangents import tracked
 from torchfilm.tools.threads import one_torch_thread
+from torchfilm.tools.times import later
 from torchfilm.tools.timing import Timings
 from torchfilm.tools.warn_once import once
 from torchfilm.turns import Turns, in_turns
@@ -108,12 +110,12 @@ class Model:
         return state
 
     @cached_property
-    def turns(self) -> list[BoundEffect | Turns]:
+    def turns(self) -> list[BoundEffect | Turns | Together]:
         """The effects in the order of a step, some of them in turns."""
         return in_turns(self.effects)
 
     @cached_property
-    def _parts(self) -> list[BoundEffect | JoinedStep | Turns]:
+    def _parts(self) -> list[BoundEffect | JoinedStep | Turns | Together]:
         """What a step runs: these, some of them joined."""
         return joined(self.turns)
 
@@ -307,10 +309,7 @@ def advanced(state: State, dt: float) -> State:
     """The state with its fields checked and its step counted; evenly, so that time gathers no
     rounding."""
     state.check_fields()
-    even = abs(state.step * dt - state.time) < 1e-9 * max(1.0, state.time)
-    return state.replace(
-        step=state.step + 1, time=(state.step + 1) * dt if even else state.time + dt
-    )
+    return state.replace(step=state.step + 1, time=later(state.time, state.step, dt))
 
 
 def why_not_replayable(model: Model) -> str:
@@ -392,6 +391,7 @@ def _bind_to_state(scene: Scene, state: State, only: Collection[int] | None) -> 
     if only is None:
         there = (*scene.declared_by, *state.fields)
         binding_checks.check_names(model.effects, there, tried)
+        binding_checks.warn_of_kept(model.effects, state, scene.founders.extra)
     return model
 
 

@@ -12,6 +12,7 @@ from torchfilm.effect import BoundEffect
 from torchfilm.effects.bound_circuit import BoundCircuit
 from torchfilm.effects.bound_medium import BoundMedium
 from torchfilm.state import State
+from torchfilm.together import Together, joins
 from torchfilm.tools.timing import Timings
 
 
@@ -37,15 +38,18 @@ class Turns:
         return state
 
 
-def in_turns(effects: Sequence[BoundEffect]) -> list[BoundEffect | Turns]:
-    """The effects, in which cells and transport act in turns where the medium asks for it."""
-    circuits = [e for e in effects if isinstance(e, BoundCircuit) and e.turns > 1]
+def in_turns(effects: Sequence[BoundEffect]) -> list[BoundEffect | Turns | Together]:
+    """The effects, in which cells and transport act in turns or together where the medium asks for
+    it."""
     media = [e for e in effects if isinstance(e, BoundMedium)]
-    found: list[BoundEffect | Turns] = []
+    joint = media and media[0].solves_together
+    circuits = [e for e in effects if isinstance(e, BoundCircuit)]
+    circuits = [e for e in circuits if (joins(e, circuits) if joint else e.turns > 1)]
+    found: list[BoundEffect | Turns | Together] = []
     for effect in effects:
         if circuits and effect is circuits[-1]:
             # at the place of the last circuit: what comes after circuits still does
-            found.append(Turns(circuits, media[0]))
+            found.append((Together if joint else Turns)(circuits, media[0]))
         elif effect not in circuits and not (circuits and effect in media):
             found.append(effect)
     return found

@@ -1,7 +1,8 @@
-"""Work and precision of the splitting of cells and medium.
+"""Work and precision of exchange between cells and medium.
 
-The studies compare Lie and Strang splitting, Δt and the tolerance of the circuits with the whole
-coupled system. A further study compares the statistics of a colony that grows for hours.
+The studies compare turns by Lie and by Strang splitting, and the solve of both together, Δt and the
+tolerance of the circuits with the whole coupled system. A further study compares the statistics of
+a colony that grows for hours.
 
 The coupled system is one ordinary differential equation of all cells and all voxels, solved by
 SciPy to 1e-10. `signals` assembles its transport. Cells read and release by the weights of the
@@ -71,7 +72,14 @@ def drop(places: torch.Tensor) -> torch.Tensor:
     return 0.1 * torch.exp(-((places[:, 0] + 8.0) ** 2 + places[:, 1] ** 2) / 128.0)
 
 
-def scene_of(case: Case, splitting: str, rtol: float, rates: Callable = lux) -> tf.Scene:
+def way_of(way: str) -> dict[str, str]:
+    """Returns the options of `Medium` for "together", or for turns by "lie" or "strang"."""
+    return (
+        {"exchange": "together"} if way == "together" else {"exchange": "turns", "splitting": way}
+    )
+
+
+def scene_of(case: Case, way: str, rtol: float, rates: Callable = lux) -> tf.Scene:
     """Returns the scene of a case."""
     half = 0.5 * VOXELS[0] * SPACING
     count = len(case.places)
@@ -83,7 +91,7 @@ def scene_of(case: Case, splitting: str, rtol: float, rates: Callable = lux) -> 
             ahl=tf.Signal(diffusion=DIFFUSION, decay=DECAY, initial=drop),
             box=((-half, -half), (half, half)),
             spacing=SPACING,
-            splitting=splitting,
+            **way_of(way),
         ),
         founders=tf.Cells(case.places, [[1.0, 0.0]] * count, length=LENGTH, radius=RADIUS),
     )
@@ -124,11 +132,20 @@ def reference(case: Case) -> tuple[np.ndarray, np.ndarray]:
     return end[: 2 * count].reshape(2, count), end[2 * count :]
 
 
+def iterations(model: tf.Model, dt: float, steps: int) -> int:
+    """Returns how often a run applies transport where it is solved together with circuits."""
+    state, total = model.start(), 0
+    for _ in range(steps):
+        state = model.step(state, dt)
+        total += int(state.reports["circuit"].iterations.sum())
+    return total
+
+
 def point(
     case: Case,
     exact: tuple[np.ndarray, np.ndarray],
     series: str,
-    splitting: str = "strang",
+    way: str = "together",
     dt: float = DT,
     rtol: float = 1e-4,
     wide: bool = False,
@@ -141,12 +158,16 @@ def point(
     """
     counted, steps = Counted(lux, "luxi"), round(UNTIL / dt)
     given = {"dtype": torch.float64 if wide else torch.float32}
-    by_torch = scene_of(case, splitting, rtol, counted).bind(**given)
+    by_torch = scene_of(case, way, rtol, counted).bind(**given)
     counted.rows = 0  # binding tries the rates
-    advance(by_torch, by_torch.start(), dt, steps)
+    transports = steps * (1 if way == "lie" else 2)
+    if way == "together":
+        transports = iterations(by_torch, dt, steps)
+    else:
+        advance(by_torch, by_torch.start(), dt, steps)
     count = len(case.places)
-    work = counted.rows / count + steps * (1 if splitting == "lie" else 2)
-    model = scene_of(case, splitting, rtol).bind(COLONIES, **given)
+    work = counted.rows / count + transports
+    model = scene_of(case, way, rtol).bind(COLONIES, **given)
     first = model.start()
     last, seconds = timed(lambda: advance(model, first, dt, steps))
     assert last is not None
@@ -156,8 +177,8 @@ def point(
         SPECIES: off(species, exact[0]),
         SIGNAL: float(np.linalg.norm(signal - exact[1]) / np.linalg.norm(exact[1])),
     }
-    label = f"{splitting}, Δt {dt:g} h, rtol {rtol:g}, float{64 if wide else 32}"
-    default = (splitting, dt, rtol, wide) == ("strang", DT, 1e-4, False)
+    label = f"{way}, Δt {dt:g} h, rtol {rtol:g}, float{64 if wide else 32}"
+    default = (way, dt, rtol, wide) == ("together", DT, 1e-4, False)
     return Point(
         series, label, errors, seconds, work, default, step=dt if series != "several" else None
     )
@@ -169,10 +190,11 @@ def split_steps(case: Case, quick: bool) -> Study:
     steps, tight = ((0.1, 0.05, DT), 1e-5) if quick else ((0.2, 0.1, 0.05, DT, 0.0125), 1e-7)
     points = [
         point(case, exact, f"Δt, {s}, rtol {tight:g}, float64", s, dt, tight, True)
-        for s in ("lie", "strang")
+        for s in ("lie", "strang", "together")
         for dt in steps
     ]
-    points += [point(case, exact, "Δt", dt=dt) for dt in ((DT,) if quick else (*steps, 0.00625))]
+    few = (DT,) if quick else (*steps, 0.00625)
+    points += [point(case, exact, f"Δt, {s}", s, dt) for s in ("strang", "together") for dt in few]
     points += [
         point(case, exact, "rtol", rtol=r)
         for r in ((1e-2,) if quick else (1e-1, 1e-2, 1e-3, 1e-5, 1e-6))
@@ -180,7 +202,7 @@ def split_steps(case: Case, quick: bool) -> Study:
     if not quick:
         points += [
             point(case, exact, "several", s, dt, r)
-            for s in ("lie", "strang")
+            for s in ("lie", "strang", "together")
             for dt in (0.2, 0.1, 0.05, 0.0125)
             for r in (1e-1, 1e-2)
         ]
@@ -205,8 +227,8 @@ TARGET = Stripe("yfp", at="border", width=4.0, cell_type=1, floor=0.2)
 MEASURES = ("band width", "band peak", "cells", "mean yfp", "mean ahl", "peak ahl outside")
 
 
-def detector(splitting: str, rtol: float) -> tf.Scene:
-    """Returns the boundary detector in a channel 16 µm wide, with the given splitting."""
+def detector(way: str, rtol: float) -> tf.Scene:
+    """Returns the boundary detector in a channel 16 µm wide, with exchange by a way."""
     ready = tf.scenes.boundary_detector(width=16.0, rtol=rtol, **STRIPE)
     effects: list[tf.Effect] = []
     for effect in ready.effects:
@@ -218,17 +240,17 @@ def detector(splitting: str, rtol: float) -> tf.Scene:
                 spacing=spacing,
                 outside=effect.outside,
                 grows=effect.grows,
-                splitting=splitting,
+                **way_of(way),
             )
         effects.append(effect)
     return ready.replace(*effects)
 
 
 def ensemble(
-    splitting: str, rtol: float, dt: float, until: float, streams: range
+    way: str, rtol: float, dt: float, until: float, streams: range
 ) -> tuple[dict[str, np.ndarray], float, float]:
     """Returns each measure of each colony, (streams,); the circuit steps of all cells; seconds."""
-    scene = detector(splitting, rtol)
+    scene = detector(way, rtol)
     model = scene.bind(colonies=len(streams), streams=list(streams))
     first = model.start()
 
@@ -276,25 +298,25 @@ def boundary(quick: bool) -> Study:
     """Returns the study of the stripe of the boundary detector."""
     until, streams, tight = (0.5, range(2), 1) if quick else (4.0, range(12), 8)
     others = range(1000, 1000 + 2 * len(streams))
-    expected, _, _ = ensemble("strang", 1e-4 if quick else 1e-6, DT / tight, until, others)
+    expected, _, _ = ensemble("together", 1e-4 if quick else 1e-6, DT / tight, until, others)
     settings = [
-        ("Δt", "Δt 0.05 h", "strang", 1e-4, 2 * DT),
-        ("Δt", "default", "strang", 1e-4, DT),
-        ("rtol", "rtol 0.01", "strang", 1e-2, DT),
+        ("Δt", "Δt 0.05 h", "together", 1e-4, 2 * DT),
+        ("Δt", "default", "together", 1e-4, DT),
+        ("rtol", "rtol 0.01", "together", 1e-2, DT),
     ]
     if not quick:
         settings = [
-            ("Δt", "Δt 0.1 h", "strang", 1e-4, 4 * DT),
+            ("Δt", "Δt 0.1 h", "together", 1e-4, 4 * DT),
             *settings[:2],
-            ("Δt", "Δt 0.0125 h", "strang", 1e-4, DT / 2),
+            ("Δt", "Δt 0.0125 h", "together", 1e-4, DT / 2),
             *settings[2:],
-            ("splitting", "lie", "lie", 1e-4, DT),
-            ("several", "rtol 0.01, Δt 0.05 h", "strang", 1e-2, 2 * DT),
-            ("several", "rtol 0.1, Δt 0.1 h, lie", "lie", 1e-1, 4 * DT),
+            ("exchange", "turns", "strang", 1e-4, DT),
+            ("several", "rtol 0.01, Δt 0.05 h", "together", 1e-2, 2 * DT),
+            ("several", "rtol 0.1, Δt 0.1 h, turns", "strang", 1e-1, 4 * DT),
         ]
     points = []
-    for series, label, splitting, rtol, dt in settings:
-        found, steps, seconds = ensemble(splitting, rtol, dt, until, streams)
+    for series, label, way, rtol, dt in settings:
+        found, steps, seconds = ensemble(way, rtol, dt, until, streams)
         distances = {
             n: distance(found[n], expected[n])
             for n in MEASURES

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from torchfilm.circuits import run
+from torchfilm.circuits import failures, run
 from torchfilm.circuits.columns import Columns, Lookup, column
 from torchfilm.circuits.names import UnknownName
 from torchfilm.circuits.trial import try_circuit
@@ -136,7 +136,7 @@ def test_a_cell_that_fails_leaves_the_others_alone(method):
     assert found.concentrations[[0, 2], 0].tolist() == pytest.approx(
         [math.exp(-0.1), 2 * math.exp(-0.1)], rel=1e-3
     )
-    said = run.words(made, found, start, 1, method, 0.1)
+    said = failures.words(made, found, start, 1, method, 0.1)
     assert "the species 'a'" in said and "not a finite number" in said and "a = 5, b = 1" in said
 
 
@@ -144,7 +144,7 @@ def test_a_signal_whose_amount_breaks_is_distinguished():
     made = circuit(lambda u, s, p, cell: ({"a": -u.a}, {"a": torch.log(u.b)}))
     start = torch.tensor([[1.0, 1.0], [1.0, 0.0], [1.0, 1.0]], dtype=F64)
     found = run.step(made, start, 0.1, settings("rk4"))
-    said = run.words(made, found, start, 1, "rk4", 0.1)
+    said = failures.words(made, found, start, 1, "rk4", 0.1)
     assert "the signal 'a'" in said and "species" not in said
     with pytest.raises(
         InputError, match=r"gives -inf for the signal 'a' at the start \(a = 1, b = 0\)"

@@ -29,7 +29,9 @@ def crowd(count: int, per_step: float = 0.1, givers: int = 1, **options) -> tf.S
     places = [[0.01 * k / count, 0.0] for k in range(count)]
     cells = tf.Cells(places, [[1.0, 0.0]] * count, 2.0, cell_type=kinds)
     area = float(tf.Scene(tf.Growth(rate=0.0), founders=cells, dim=2).bind().start().area[0])
-    medium = tf.Medium(a=tf.Signal(0.0, decay=1.0), box=((-2, -2), (2, 2)), spacing=4.0)
+    medium = tf.Medium(
+        a=tf.Signal(0.0, decay=1.0), box=((-2, -2), (2, 2)), spacing=4.0, exchange="turns"
+    )
     rates = {0: giving, 1: still} if givers < count else {0: giving}
     circuit = tf.Circuit(rates, species="a", D1=per_step * 64.0 / (DT * area), **options)
     return tf.Scene(circuit, medium, founders=cells, dim=2, dt=DT)

@@ -1,4 +1,4 @@
-"""Circuits and transport in several turns within a step: `Medium(steps=…)`."""
+"""Circuits and transport in several turns within a step: `Medium(exchange="turns", steps=…)`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FOUR = tf.Cells([[0.0, 0.0], [3.0, 1.0], [-2.0, 4.0], [1.0, -5.0]], [[1.0, 0.0]]
 
 
 def medium(steps: int = 1, diffusion: float = 30.0, decay: float = 0.5, **options) -> tf.Medium:
-    given = {"box": BOX, "spacing": 4.0, "steps": steps, **options}
+    given = {"box": BOX, "spacing": 4.0, "steps": steps, "exchange": "turns", **options}
     return tf.Medium(ahl=tf.Signal(diffusion, decay=decay), **given)
 
 
@@ -59,6 +59,7 @@ def test_all_circuits_and_signals_take_the_turns(method, splitting):
                 ahl=tf.Signal(30.0),
                 food=tf.Signal(10.0, initial=lambda at: 1.0 + at[:, 0] ** 2),
                 box=BOX, spacing=4.0, steps=steps, splitting=splitting, method=method,
+                exchange="turns",
             ),
             founders=FOUR,
         )  # fmt: skip

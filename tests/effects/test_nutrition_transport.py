@@ -293,7 +293,7 @@ def test_explain_says_how_the_nutrient_moves():
     slow, fast = tf.scenes.nutrient_limited(), tf.scenes.nutrient_limited(diffusion=2e6)
     said = [str(tf.explain(s)) for s in (slow, fast)]
     assert "by a series, order 2" in said[0] and "by backward Euler, order 1" in said[1]
-    assert all("moved by nutrition, together with uptake" in x for x in said)
+    assert all("moved together with nutrition" in x for x in said)
 
 
 @pytest.mark.parametrize("wanted", [20.0, 40.0])

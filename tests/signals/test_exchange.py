@@ -410,6 +410,7 @@ def test_the_error_of_taking_turns_is_that_of_a_run(diffusion, splitting):
     scene = tf.Scene(
         tf.Circuit(lambda u, s, p, cell: ({"m": -u.m}, {"ahl": p.q}), species="m", q=spacing**3),
         tf.Medium(
+            exchange="turns",
             ahl=tf.Signal(diffusion=diffusion, decay=decay), box=((-half, -half), (half, half)),
             spacing=spacing, splitting=splitting,
         ),

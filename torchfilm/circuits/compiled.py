@@ -56,6 +56,11 @@ class Compiled:
         """Itself: it never changes, and a module cannot be copied."""
         return self
 
+    @property
+    def free(self) -> int:
+        """How many variables, the last ones, are sums that may be below 0."""
+        return sum(n.startswith("own.") for n in self.equations.variables)
+
     def leaves(self) -> str:
         """The text of what `prepared` is given for the cell n."""
         return values_text(self.equations.leaves, self.columns, self.numbers)
@@ -150,8 +155,10 @@ def values_text(
 
 
 def pools(circuit: CircuitCells, rows: Tensor) -> dict[str, Tensor]:
-    """What the equations of an exchange read: the pool, and whether it is a reservoir, (M,)."""
+    """What the equations of an exchange read: the pool, and whether it is a reservoir, (M,); or how
+    fast signals change."""
     found = {"pool": circuit.pool, "away": circuit.in_reservoir}
+    found |= {f"ramp_{n}": x for n, (_, x) in (circuit.ramp or {}).items()}
     return {n: x.index_select(0, rows) for n, x in found.items() if x is not None}
 
 
@@ -248,8 +255,8 @@ def rates_of(
     final, given = simple[: len(rates)], simple[len(rates) :]
     if given:
         final += _exchange(given, circuit, trace)
-        if circuit.in_reservoir is not None:
-            more = [f"own.{way}_{n}" for way in ("to", "from") for n in circuit.exchanged]
+        if circuit.sums_exchange:
+            more = [f"own.released_{n}" for n in circuit.exchanged]
             trace.variables += more
             trace.kinds |= {n: (dtype, 1) for n in more}
     return trace.equations(final)
@@ -284,17 +291,20 @@ def _without_literals(
 
 
 def _exchange(flux: Sequence[Column], circuit: CircuitCells, trace: Trace) -> list[Column]:
-    """Rates of the pools' concentrations, and of what a reservoir is given and gives, as
+    """Rates of the concentrations outside, and of what a reservoir, or the medium, is given, as
     `CircuitCells.rates` has them."""
+    if circuit.ramp is not None:
+        ramp = {n: (x.dtype, 1) for n, (_, x) in circuit.ramp.items()}
+        changes = [trace.column(f"own.ramp_{n}", ramp[n]) for n in circuit.exchanged]
+        return [*changes, *flux]
     assert circuit.pool is not None
     pool = trace.column("own.pool", (circuit.pool.dtype, 1))
     into = [apply("div", x, pool) for x in flux]
     if circuit.in_reservoir is None:
         return into
     away = trace.column("own.away", (torch.bool, 1))
-    part = lambda op, x: apply("mul", 0.5, apply(op, apply("abs", x), x))
-    up, down = ([apply("where", away, part(op, x), 0.0) for x in flux] for op in ("add", "sub"))
-    return [*(apply("where", away, 0.0, x) for x in into), *up, *down]
+    released = [apply("where", away, x, 0.0) for x in flux]
+    return [*(apply("where", away, 0.0, x) for x in into), *released]
 
 
 @cache

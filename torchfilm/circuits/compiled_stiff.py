@@ -38,7 +38,7 @@ class CompiledStiff(Compiled):
         return (
             self.head(CONSTANTS)
             + text
-            + method(len(self.equations.variables), prepared, self.leaves())
+            + method(len(self.equations.variables), self.free, prepared, self.leaves())
         )
 
     def slopes_by_torch(self, circuit: CircuitCells, u: Tensor, rows: Tensor) -> Tensor:
@@ -102,7 +102,7 @@ class CompiledTangents(Compiled):
         fixed = {"c": prepared, "leaf": len(equations.leaves), "turn": len(names)}
         return "".join((
             self.head(CONSTANTS), text, tangent_functions(equations, names),
-            step(size), tangent_method(size, fixed, leaves, turns),
+            step(size, self.free), tangent_method(size, self.free, fixed, leaves, turns),
         ))  # fmt: skip
 
     def rodas3(

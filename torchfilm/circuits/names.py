@@ -82,10 +82,12 @@ def label_of(part: object) -> str:
 
 def has_no(label: str, name: str, known: Sequence[str]) -> str:
     """The message for a name that one of the arguments of a rate function does not have."""
-    message = unknown(f"{label} has no {name!r}", name, known)
-    return (
-        f"{message} Give the circuit its value: Circuit(…, {name}=…)." if label == "p" else message
-    )
+    first = f"Rules(variables={{{name!r}: 0.0}})"
+    hint = {
+        "p": f" Give the circuit its value: Circuit(…, {name}=…).",
+        "cell": f" What a rule sets only at times needs a first value: {first}.",
+    }
+    return unknown(f"{label} has no {name!r}", name, known) + hint.get(label, "")
 
 
 def unknown(what: str, name: str, known: Sequence[str]) -> str:

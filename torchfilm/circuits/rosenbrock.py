@@ -25,7 +25,7 @@ from torch import Tensor
 
 from torchfilm.circuits import linear
 from torchfilm.tools.reads import known_rows_where, numbers, reads_are_free, rows_where
-from torchfilm.tools.tangents import both, forward_mode, with_tangent
+from torchfilm.tools.tangents import both, forward_mode, outside_checkpoints, with_tangent
 
 # rates(u, rows): du/dt (M, S), conc/h, of the cells `rows` (M,) at concentrations u (M, S). Row i
 # of the result depends on row i of u only.
@@ -73,6 +73,7 @@ def rodas3(
     max_steps: int = MAX_STEPS,
     first_step: float | None = None,
     nonnegative: bool = True,
+    free: int = 0,
     slopes: Rates | None = None,
 ) -> tuple[Tensor, RosenbrockReport]:
     """Concentrations (N, S) after dt hours, and the report; each cell takes its own steps.
@@ -84,7 +85,7 @@ def rodas3(
     values below four units in the last place of u's dtype count as four units. first_step: h;
     default dt. nonnegative: a species that starts at or above 0 stays there. The rates are
     continued linearly below 0, and a step that ends below 0 is moved towards two steps of backward
-    Euler.
+    Euler. free: so many of the last ones may go below 0 all the same: sums of what passes.
 
     slopes: ∂ rates/∂u, (S, S, M), at u (S, M), differentiable; by default from derivatives of
     `rates` by torch.
@@ -104,8 +105,9 @@ def rodas3(
         u.requires_grad or rates(u.index_select(0, one), one).requires_grad
     )
     method = _Tableau(
-        rates, u.dtype, max(rtol, 4 * torch.finfo(u.dtype).eps), scale, nonnegative, tracked, slopes
-    )
+        rates, u.dtype, max(rtol, 4 * torch.finfo(u.dtype).eps), scale,
+        species - free if nonnegative else 0, tracked, slopes,
+    )  # fmt: skip
     first = whole if first_step is None else whole.clamp(max=first_step)
     at, report = _advance(method, start, whole, first, max_steps)
     return at.t().to(u.dtype), report
@@ -114,7 +116,8 @@ def rodas3(
 class _Tableau:
     """One step of the method for some cells; arrays are (S, M) in float64, species first.
 
-    tracked: whether a gradient is required.
+    above: how many species may not go below 0, the first ones. tracked: whether a gradient is
+    required.
     """
 
     def __init__(
@@ -123,12 +126,21 @@ class _Tableau:
         dtype: torch.dtype,
         rtol: float,
         atol: Tensor,
-        nonnegative: bool,
+        above: int,
         tracked: bool,
         slopes: Rates | None,
     ):
         self.rates, self.dtype, self.rtol, self.atol = rates, dtype, rtol, atol
-        self.nonnegative, self.tracked, self.slopes = nonnegative, tracked, slopes
+        self.above, self.tracked, self.slopes = above, tracked, slopes
+
+    def _least(self, u: Tensor) -> Tensor:
+        """What a step from u (S, M) may lead to, (S, M)."""
+        low = u.detach().clamp(max=0.0)
+        return (
+            low
+            if self.above == len(u)
+            else low.index_fill(0, torch.arange(self.above, len(u), device=u.device), -torch.inf)
+        )
 
     def evaluate(self, u: Tensor, rows: Tensor) -> Tensor:
         """The rates, (S, M)."""
@@ -148,7 +160,7 @@ class _Tableau:
     def _backward(self, u: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """By a backward pass; the i-th copy gives the gradient of species i's rate."""
         size, count = u.shape
-        with torch.enable_grad():
+        with torch.enable_grad(), outside_checkpoints():
             copies = u.repeat(1, size).requires_grad_()
             out = self.rates(copies.t(), rows.repeat(size))
             f = with_tangent(*both(out))[:count].t().to(torch.float64)
@@ -197,11 +209,11 @@ class _Tableau:
             lu, sound, leaps = linear.factor(
                 matrix, 2.0 * per_h + torch.diagonal(jacobian, dim1=0, dim2=1).t().abs()
             )
-        low = u.detach().clamp(max=0.0)
+        low = self._least(u)
 
         def rate(y: Tensor) -> Tensor:
             below = y < low
-            if not self.nonnegative or (reads_are_free(u.device) and not bool(below.any())):
+            if not self.above or (reads_are_free(u.device) and not bool(below.any())):
                 return self.evaluate(y, rows)
             inside = torch.where(below, low, y)
             return self.evaluate(inside, rows) + linear.multiply(jacobian, y - inside)
@@ -221,7 +233,7 @@ class _Tableau:
                 sound & (new.abs().amax(0) < torch.finfo(self.dtype).max), error, torch.nan
             )
         broken = torch.zeros_like(sound)
-        if self.nonnegative:
+        if self.above:
             noise = (
                 8
                 * torch.finfo(self.dtype).eps
@@ -252,7 +264,7 @@ class _Tableau:
         (u' − v) with the greatest θ ≤ 1 that is not below zero. The result lies in the range of f
         as well, so conserved sums are kept.
         """
-        low = u.detach().clamp(max=0.0)
+        low = self._least(u)
         new = torch.where((new < low) & (new >= low - noise), low, new)
         (at,) = rows_where((new < low).any(0))
         change = torch.zeros_like(new[0])

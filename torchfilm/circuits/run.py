@@ -3,7 +3,8 @@ rates. Each cell has a pool: the part of the medium from which it may take in th
 
 The solver integrates exchange with the medium together with the reactions inside the cell. The
 variables are the species and, for each exchanged signal, its concentration in the cell's pool. So
-however fast the exchange, neither side falls below zero, and amounts are conserved.
+however fast the exchange, neither side falls below zero, and amounts are conserved. Where transport
+is solved together with the cells there is no pool: concentrations outside change at given rates.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ from torchfilm.tools.checks import InputError
 from torchfilm.tools.deterministic_math import deterministic_functions
 from torchfilm.tools.tangents import has_tangent, in_forward_mode, scaled
 
+# From here on a code of `CircuitOutcome` is this plus the number of a reaction that failed.
+MOLECULES = 100
 # Returns the rates of species by name, conc/h, and the amounts per hour that the cell releases to
 # signals by name, conc·µm³/h.
 RateFunction = Callable[[Names, Names, Names, Names], Any]
@@ -56,7 +59,9 @@ class CircuitCells:
     cells by name. compiled: the same as equations, where it could be traced; by_torch: whether
     torch evaluates them. signals: the concentration outside each cell, (N,) by name. pool: (N,)
     µm³, each cell's part of the medium, if the circuit exchanges a signal. in_reservoir: (N,) bool,
-    cells whose pool is a reservoir of constant concentration, or None.
+    cells whose pool is a reservoir of constant concentration, or None. ramp: in place of a pool,
+    what the exchanged signals are at first, and the rates at which they change, conc/h: (N,) each
+    by name; `signals` is then half way. None with pools.
     """
 
     part: RateFunction | Network
@@ -68,10 +73,21 @@ class CircuitCells:
     signals: Mapping[str, Tensor]
     pool: Tensor | None = None
     in_reservoir: Tensor | None = None
+    ramp: Mapping[str, tuple[Tensor, Tensor]] | None = None
     label: str = "circuit"
     compiled: Compiled | None = None
     by_torch: bool = False
     seen: dict[str, set[str]] = field(default_factory=dict)
+
+    @property
+    def sums_exchange(self) -> bool:
+        """Whether it has variables of what it gives and takes."""
+        return self.in_reservoir is not None or self.ramp is not None
+
+    @property
+    def bounded(self) -> int:
+        """How many variables, the first, may not be below 0: concentrations."""
+        return len(self.species) + len(self.exchanged)
 
     def names(self, u: Tensor, rows: Tensor) -> tuple[Names, Names, Names, Names]:
         """The arguments of a rate function, for variables u (m, ≥ S + E) of the cells `rows` (m,)
@@ -129,15 +145,13 @@ class CircuitCells:
         return out
 
     def rates(self, u: Tensor, rows: Tensor) -> Tensor:
-        """du/dt of all variables, (m, S + E), or (m, S + 3E) with a reservoir; rows (m,) among the
-        M."""
+        """du/dt of all variables, (m, S + E), or (m, S + 2E) with a reservoir or ramps; rows (m,)
+        among the M."""
         rows = self.rows.index_select(0, rows)
         inside, outside = self.changes(u, rows)
         none = torch.zeros_like(u[:, 0])
         columns = [inside.get(n, none) for n in self.species]
         if self.exchanged:
-            assert self.pool is not None
-            pool = self.pool.index_select(0, rows)
             new = [n for n in outside if n not in self.exchanged]
             if new:
                 raise InputError(
@@ -145,14 +159,19 @@ class CircuitCells:
                     " return it, 0 where nothing passes."
                 )
             flux = [outside.get(n, none) for n in self.exchanged]
+            if self.ramp is not None:
+                columns += [
+                    self.ramp[n][1].index_select(0, rows).to(u.dtype) for n in self.exchanged
+                ]
+                return torch.stack([*columns, *flux], 1)
+            assert self.pool is not None
+            pool = self.pool.index_select(0, rows)
             if self.in_reservoir is None:
                 columns += [x / pool for x in flux]
             else:
                 away = self.in_reservoir.index_select(0, rows)
                 columns += [torch.where(away, 0.0, x / pool) for x in flux]
-                # at 0 the derivatives of both add up to 1
-                columns += [torch.where(away, 0.5 * (x.abs() + x), 0.0) for x in flux]
-                columns += [torch.where(away, 0.5 * (x.abs() - x), 0.0) for x in flux]
+                columns += [torch.where(away, x, 0.0) for x in flux]
         return torch.stack(columns, 1)
 
     def per_unit(self, given: float | Tensor) -> Tensor:
@@ -168,11 +187,12 @@ class CircuitCells:
         return self.compiled.slopes_by_torch(self, u, self.rows.index_select(0, rows))
 
     def start(self, concentrations: Tensor) -> Tensor:
-        """The variables at the start: concentrations (M, S), then pools, then the amounts given to
-        a reservoir and the amounts taken from it."""
-        columns = [self.signals[n].index_select(0, self.rows) for n in self.exchanged]
-        if self.in_reservoir is not None:
-            columns += [torch.zeros_like(c) for c in columns] * 2
+        """The variables at the start: concentrations (M, S), then pools, then the amounts released
+        to a reservoir, or with ramps to the medium, less those taken from it."""
+        first = self.signals if self.ramp is None else {n: x for n, (x, _) in self.ramp.items()}
+        columns = [first[n].index_select(0, self.rows) for n in self.exchanged]
+        if self.sums_exchange:
+            columns += [torch.zeros_like(c) for c in columns]
         return (
             torch.cat([concentrations, *(c.unsqueeze(1) for c in columns)], 1)
             if columns
@@ -182,9 +202,9 @@ class CircuitCells:
 
 @dataclass(frozen=True, eq=False)
 class CircuitOutcome:
-    """The result of a step: concentrations (M, S); amounts released to the pools and to a
-    reservoir, conc·µm³, (M,) by signal; whether a cell failed, (M,) bool, and why, (M,) codes for
-    `words`; number of steps, (M,) int64.
+    """The result of a step: concentrations (M, S); amounts released to the pools, and to a
+    reservoir or with ramps to the medium, conc·µm³, (M,) by signal; whether a cell failed, (M,)
+    bool, and why, (M,) codes for `failures.words`; number of steps, (M,) int64.
     """
 
     concentrations: Tensor
@@ -218,26 +238,32 @@ def step(
             found = compiled.integrate(circuit, start, dt, rtol, atol)
         if found is None:
             slopes = None if compiled is None else circuit.slopes
-            found = rosenbrock.rodas3(circuit.rates, start, dt, rtol=rtol, atol=atol, slopes=slopes)
+            free = start.shape[1] - circuit.bounded
+            found = rosenbrock.rodas3(
+                circuit.rates, start, dt, rtol=rtol, atol=atol, free=free, slopes=slopes
+            )
         end, report = found
         code, steps = report.status, report.accepted + report.rejected
     else:
         end = _equal_steps(circuit, start, dt, settings)
         # an exact solution stays above zero: the step is too long for an explicit method
         scale = start.abs() + end.abs()
-        below = (end < -(settings.atol + settings.rtol * scale.nan_to_num())) & (start >= 0)
+        may_not = torch.arange(start.shape[1], device=start.device) < circuit.bounded
+        may_not = may_not & (start >= 0)
+        below = (end < -(settings.atol + settings.rtol * scale.nan_to_num())) & may_not
         code = torch.where(below.any(1), rosenbrock.BELOW_ZERO, rosenbrock.DONE)
         code = torch.where(torch.isfinite(end).all(1), code, rosenbrock.NOT_FINITE)
         # values below zero by less than the tolerance become 0; in other cells the step failed
-        end = torch.where((end < 0) & (start >= 0), 0.0, end)
+        end = torch.where((end < 0) & may_not, 0.0, end)
     size, more = len(circuit.species), len(circuit.exchanged)
     pools, reservoir = {}, {}
     for k, name in enumerate(circuit.exchanged):
-        assert circuit.pool is not None
-        pool = circuit.pool.index_select(0, circuit.rows)
-        pools[name] = scaled(end[:, size + k] - start[:, size + k], pool)
-        if circuit.in_reservoir is not None:
-            reservoir[name] = end[:, size + more + k] - end[:, size + 2 * more + k]
+        if circuit.ramp is None:
+            assert circuit.pool is not None
+            pool = circuit.pool.index_select(0, circuit.rows)
+            pools[name] = scaled(end[:, size + k] - start[:, size + k], pool)
+        if circuit.sums_exchange:
+            reservoir[name] = end[:, size + more + k]
     return CircuitOutcome(end[:, :size], pools, reservoir, code != 0, code, steps)
 
 
@@ -345,82 +371,3 @@ def _split(
     away = circuit.in_reservoir.index_select(0, circuit.rows)
     pools = {n: torch.where(away, 0.0, x).to(dtype) for n, x in amount.items()}
     return pools, {n: torch.where(away, x, 0.0).to(dtype) for n, x in amount.items()}
-
-
-MOLECULES = 100
-
-
-def words(
-    circuit: CircuitCells, code: int, concentrations: Tensor, k: int, method: str, dt: float
-) -> str:
-    """Describes the failure of the k-th of the M cells, in a step from concentrations (M, S)."""
-    if method in ("tau_leap", "direct"):
-        assert isinstance(circuit.part, Network)
-        if code >= MOLECULES:
-            reaction = circuit.part.reactions[code - MOLECULES]
-            return (
-                f"the reaction {reaction.name or str(reaction)!r} has"
-                f" {stochastic.STATUS[stochastic.BAD_PROPENSITY]}"
-            )
-        return stochastic.STATUS[code]
-    if code == rosenbrock.BELOW_ZERO:
-        start, one = circuit.start(concentrations), torch.tensor([k], device=concentrations.device)
-        slope = circuit.rates(start.index_select(0, one), one)[0]
-        names = (*circuit.species, *(f"out.{n}" for n in circuit.exchanged))
-        if not bool((slope[: len(names)] < 0).any()):
-            return rosenbrock.STATUS[code] + _runaway(circuit, concentrations, k, dt)
-        first = int(torch.where(slope < 0, start[k] / -slope, torch.inf)[: len(names)].argmin())
-        hint = ". Take more steps, or method='rosenbrock'" if method != "rosenbrock" else ""
-        return (
-            f"{rosenbrock.STATUS[code]}, {names[first]!r} first, from {float(start[k, first]):g} at"
-            f" a rate of {float(slope[first]):g}/h{hint}"
-        )
-    bad = _not_finite(circuit, concentrations, k, dt)
-    if code != rosenbrock.NOT_FINITE and not bad:
-        return rosenbrock.STATUS[code] + _runaway(circuit, concentrations, k, dt)
-    at = ", ".join(
-        f"{n} = {float(x):g}" for n, x in zip(circuit.species, concentrations[k], strict=True)
-    )
-    return (
-        f"the rate of {' and '.join(bad) or 'a species, on the way,'} is not a finite number, at"
-        f" {at}" + (" or soon after" if bad else "")
-    )
-
-
-@torch.no_grad()
-def _runaway(circuit: CircuitCells, concentrations: Tensor, k: int, dt: float) -> str:
-    """The species of the k-th cell that would more than double in a step, the fastest, if any."""
-    one = torch.tensor([k], device=concentrations.device)
-    start, now = circuit.start(concentrations), concentrations[k]
-    slope = circuit.rates(start.index_select(0, one), one)[0]
-    share = torch.where(now > 0, slope[: len(circuit.species)] / now, 0.0)
-    most = int(share.argmax())
-    if not float(share[most]) * dt > 1:
-        return ""
-    return (
-        f": {circuit.species[most]!r} runs away, from {float(now[most]):g} at a rate of"
-        f" {float(slope[most]):g}/h"
-    )
-
-
-@torch.no_grad()
-def _not_finite(circuit: CircuitCells, concentrations: Tensor, k: int, dt: float) -> list[str]:
-    """The species and signals whose rates in the k-th cell are not finite, at the start of the step
-    or further along it: an adaptive method stops before it gets there."""
-    one = torch.tensor([k], device=concentrations.device)
-    start, rows = (
-        circuit.start(concentrations).index_select(0, one),
-        circuit.rows.index_select(0, one),
-    )
-    slope = torch.nan_to_num(circuit.rates(start, one))
-    for share in (0.0, 0.01, 0.1, 0.5, 1.0):
-        inside, outside = circuit.changes((start + share * dt * slope).clamp(min=0.0), rows)
-        bad = [
-            f"the {what} {n!r}"
-            for what, found in (("species", inside), ("signal", outside))
-            for n, x in found.items()
-            if not bool(torch.isfinite(x).all())
-        ]
-        if bad:
-            return bad
-    return []

@@ -212,17 +212,17 @@ def tuple_of(form: str, size: int) -> str:
     return f"({each(form, size, ', ')}{',' * (size == 1)})"
 
 
-def method(size: int, prepared: int, leaves: str) -> str:
-    """The step and the loop over cells, for so many variables and numbers that are prepared.
-    leaves: the text of a cell's."""
+def method(size: int, free: int, prepared: int, leaves: str) -> str:
+    """The step and the loop over cells, for so many variables, of which the last may be `free`, and
+    numbers that are prepared. leaves: the text of a cell's."""
     given, what = "at, columns, numbers", "columns (K, M), numbers (L,)."
     carried, fixed = {"u": ("at", "new")}, {"c": prepared}
-    return step(size) + loop(size, carried, fixed, {"leaf": leaves}, given, what)
+    return step(size, free) + loop(size, carried, fixed, {"leaf": leaves}, given, what)
 
 
-def step(size: int) -> str:
+def step(size: int, free: int) -> str:
     """The text of an attempt and of its control."""
-    return substituted(STEP, size)
+    return substituted(STEP, size, free)
 
 
 def loop(
@@ -260,8 +260,9 @@ def loop(
     )  # fmt: skip
 
 
-def substituted(form: str, size: int, **more: str) -> str:
-    """The text of a form for so many variables; more: parts of its own."""
+def substituted(form: str, size: int, free: int, **more: str) -> str:
+    """The text of a form for so many variables, of which the last ones, `free`, may be below 0;
+    more: parts of its own."""
     lines, many = partial(each, size=size), partial(tuple_of, size=size)
     round_up = "{x}# = where(({x}# < low#) & ({x}# >= low# - noise#), low#, {x}#)"
     return form.format(
@@ -281,7 +282,8 @@ def substituted(form: str, size: int, **more: str) -> str:
             "    share = where(new# < low#, nearer, share)"
         ),
         moved=many("_most(s# + share * (new# - s#), low#)"),
-        low_of=lines("low# = where(0.0 < u#, 0.0, u#)"),
+        low_of=each("low# = where(0.0 < u#, 0.0, u#)", size - free)
+        + "".join(f"\n    low{k} = like(-np.inf, u{k})" for k in range(size - free, size)),
         second=many("f# + 4.0 * p * a#"),
         y_of=lines("y# = u# + 2.0 * a#"),
         third=many("r# + p * (a# - b#)"),

@@ -117,7 +117,7 @@ def step_moved(u, t, c, leaf, turn, h, eps):
 NAMES = ("t", "ta", "tb", "td", "te", "tf", "tm", "tn", "tr", "ts", "ty")
 
 
-def tangent_method(size: int, fixed: Mapping[str, int], leaves: str, turns: str) -> str:
+def tangent_method(size: int, free: int, fixed: Mapping[str, int], leaves: str, turns: str) -> str:
     """The step with its tangent, and the loop over cells, for so many variables. fixed: how many
     numbers are prepared (c), of the leaves, and turn. leaves, turns: the text of a cell's values
     and of their tangents."""
@@ -128,15 +128,16 @@ def tangent_method(size: int, fixed: Mapping[str, int], leaves: str, turns: str)
         " of columns\n    (K, M) and `turned` (R,) of numbers (L,)."
     )
     begin = {"leaf": leaves, "turn": turns}
-    return tangent_step(size) + loop(size, carried, fixed, begin, given, what, "_moved")
+    return tangent_step(size, free) + loop(size, carried, fixed, begin, given, what, "_moved")
 
 
-def tangent_step(size: int) -> str:
+def tangent_step(size: int, free: int) -> str:
     """The text of the step's derivative."""
     lines, many = partial(each, size=size), partial(tuple_of, size=size)
     return substituted(
         STEP,
         size,
+        free,
         **{x: many(f"{x}#") for x in NAMES},
         ty_inside=many("where(below#, 0.0, ty#)"),
         ty_less_inside=many("where(below#, ty#, 0.0)"),

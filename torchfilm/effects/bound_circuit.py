@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -26,17 +25,17 @@ from torchfilm.circuits.tracing import Untraceable
 from torchfilm.circuits.trial import try_circuit
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.circuit_cells import Kind, cell_column, cell_names, cells_of_type
-from torchfilm.effects.circuit_kernels import CircuitKernels
+from torchfilm.effects.circuit_checks import check_read
+from torchfilm.effects.circuit_kernels import CircuitKernels, PreparedStep, Taken
 from torchfilm.effects.circuit_report import Failures
-from torchfilm.medium_exchange import MediumExchange
-from torchfilm.parameters import number_range
+from torchfilm.effects.circuit_words import methods_of, together_lines
+from torchfilm.medium_exchange import Around, Exchanged, MediumExchange, Ramped, form_of
 from torchfilm.resolver import Values, snapshot
 from torchfilm.state import OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import why_torch
-from torchfilm.tools.tangents import scaled
+from torchfilm.tools.tangents import outside_checkpoints, scaled
 from torchfilm.tools.warn_once import warn
-from torchfilm.values import numbers
 
 if TYPE_CHECKING:
     from torchfilm.effects.circuit import Circuit
@@ -66,13 +65,14 @@ class BoundCircuit(BoundEffect):
         self.rates = snapshot(effect.rates, "Circuit.rates", binding.batch)
         self.networks: dict[Kind, run.Network] = {}
         self.exchanged: dict[Kind, tuple[str, ...]] = {}
-        # by cell type and whether there is a reservoir: the compiled circuit, or why there is none
-        self.compiled: dict[tuple[Kind, bool], Compiled | str] = {}
+        # by cell type and form of exchange: the compiled circuit, or why there is none
+        self.compiled: dict[tuple[Kind, str], Compiled | str] = {}
         self.kernels = CircuitKernels(self)
         self.by_torch = why_torch("Circuit", effect.backend, binding.batch.device)
         self.traced_reads: tuple[str, ...] = ()
         self.signals: tuple[str, ...] = ()  # that rates read or change
         self.fields = tuple(effect.variables.values())
+        self.transport: Any = None  # where it is solved together with it
 
     # --- binding -------------------------------------------------------------------------
 
@@ -138,7 +138,7 @@ class BoundCircuit(BoundEffect):
                 self._unlike(state, rows, kind, found),
                 derivatives=circuit.method == "rosenbrock",
             )
-        self._check_constants(seen["p"])
+        check_read(circuit, seen["p"])
         if circuit.is_stochastic and self.values.requires_grad:
             warn(
                 f"Circuit.method = {circuit.method!r} passes no gradient on: numbers of molecules"
@@ -177,14 +177,17 @@ class BoundCircuit(BoundEffect):
         around = {n: x.index_select(0, rows) * more.to(x.dtype) for n, x in found.items()}
         return self._named(cells, number, kind, (), around)
 
-    def _compiled(self, kind: Kind, state: State, cells: run.CircuitCells) -> run.CircuitCells:
+    def _compiled(
+        self, kind: Kind, form: str, state: State, cells: run.CircuitCells
+    ) -> run.CircuitCells:
         """The cells with their circuit's equations, where there are: torch's derivatives, too."""
-        key, stiff = (kind, cells.in_reservoir is not None), self.effect.method == "rosenbrock"
+        key, stiff = (kind, form), self.effect.method == "rosenbrock"
         if cells.rows.numel() == 0 or (self.by_torch and not stiff):
             return cells
         if key not in self.compiled:
             try:
-                self.compiled[key] = self._equations(state, cells)
+                with outside_checkpoints():
+                    self.compiled[key] = self._equations(state, cells)
             except Untraceable as why:
                 self.compiled[key] = said = f"{cells.label}: {why}"
                 if self.effect.backend == "compiled":
@@ -203,32 +206,6 @@ class BoundCircuit(BoundEffect):
         if self.effect.method == "rosenbrock":
             return compiled_stiff(cells)
         return compiled_explicit(cells, self.effect.method, state.dtype)
-
-    def _check_constants(self, read: set[str]) -> None:
-        """Raise InputError for a constant that looks like another name, and warn of one that no
-        rate reads."""
-        given = self.effect.parameters
-        own = {f.name for f in dataclasses.fields(self.effect)}
-        options = sorted(own - {"rates", "species", "parameters"})
-        for name in given:
-            if name in read:
-                continue
-            near = difflib.get_close_matches(name, options, 1, 0.75)
-            if near:
-                raise checks.InputError(
-                    f"Circuit.{name} is a constant that no rate reads. Did you mean the option"
-                    f" {near[0]}?"
-                )
-            known = [n for n in read if n not in given]
-            like = difflib.get_close_matches(name, known, 1)
-            warn(
-                f"Circuit.{name} is a constant that no rate reads"
-                + (
-                    f". Did you mean {like[0]!r}?"
-                    if like
-                    else ": remove it, or use it as p." + name + "."
-                )
-            )
 
     def _whole_molecules(self, state: State) -> State:
         """First concentrations that are whole numbers of molecules: rounded up or down at random,
@@ -251,33 +228,23 @@ class BoundCircuit(BoundEffect):
         return [self.by_torch] if self.by_torch else parts
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        c = self.effect
-        molecules = (
-            f"{number_range(numbers(c.molecules_per_unit))} molecules in a unit of concentration ×"
-            " µm³; no gradient"
-        )
-        said = {
-            "rosenbrock": (
-                f"stiff solver (Rodas3), each cell in steps of its own: error at most {c.atol:g} +"
-                f" {c.rtol:g}·|u| in each; nothing below 0"
-            ),
-            "tau_leap": f"molecule by molecule, tau-leaping (ε = 0.03), {molecules}",
-            "direct": f"molecule by molecule, one event after the other, {molecules}",
-        }
-        count = c.steps * self.turns
-        explicit = (
-            f"{c.method}, {count} equal step(s) of {dt / count:g} h; nothing controls its error"
-        )
-        lines = [said.get(c.method, explicit)]
-        why = [f"computed by torch: {x}" for x in self._why_torch()]
-        lines += why or ["computed by compiled functions of its equations"]
-        if self.exchanges():
-            names = ", ".join(self.exchanges())
-            lines.append(
-                f"exchanges {names} with each cell's own pool: amounts kept to rounding; first"
-                f" order in dt{f'/{self.turns}' if self.turns > 1 else ''}"
-            )
+        exchanged = () if self.transport else self.exchanges()
+        lines = methods_of(self.effect, dt, self.turns, self._why_torch(), exchanged)
+        if self.transport:
+            dt = dt / self.transport.medium.steps
+            rates = {n: self.transport.exchanges_per_hour(n, state) for n in self.exchanges()}
+            lines += together_lines({n: x * dt for n, x in rates.items()})
         return lines
+
+    @property
+    def why_turns(self) -> str:
+        method = self.effect.method
+        jumps = f"Circuit.method = {method!r} makes amounts that jump: no equation can be solved."
+        return jumps if self.effect.is_stochastic else ""
+
+    def moves_by(self, transport: Any) -> bool:
+        self.transport = transport
+        return transport is not None
 
     # --- stepping ------------------------------------------------------------------------
 
@@ -292,13 +259,29 @@ class BoundCircuit(BoundEffect):
         if state.cells == 0:
             return state
         medium = MediumExchange.of(state, self.signals)
-        now = state.replace(time=state.time + done * dt) if done else state
-        middle, start = self.begun(now, 1.0 / (number - done))
         report = Failures(state, self.effect.method, dt)
-        rows = {k: x for k in self.rates if (x := cells_of_type(state, k)).numel()}
-        signals, pool = ({}, None) if medium is None else (medium.found, medium.pool)
-        around = Surroundings(start, signals, pool, state.colony_id, state.colony)
-        taken = self.kernels.taken(middle, rows, medium, around) if dt else {}
+        changed = self.changed(state, dt, done, number, medium, report)
+        exchanged = None if medium is None else medium.exchanged()
+        state = state.with_fields(**changed) if medium is None else medium.settle(**changed)
+        return self.reported(state, report, exchanged, done)
+
+    def reported(
+        self, state: State, report: Failures, exchanged: Exchanged | None, done: int,
+        noted: Mapping[str, Any] | None = None,
+    ) -> State:  # fmt: skip
+        """The state with the report of a turn added to those that are `done`. noted: more of it."""
+        made = dataclasses.replace(report.report(exchanged), **(noted or {}))
+        made = made.after(state.reports[self.title]) if done else made
+        return state.replace(reports={**state.reports, self.title: made})
+
+    def changed(
+        self, state: State, dt: float, done: int, number: int, medium: Around | None,
+        report: Failures,
+    ) -> dict[str, Tensor]:  # fmt: skip
+        """The fields that `turn` changes, (N,) by name; the medium is told what cells give, and the
+        report what failed."""
+        middle, rows, around, taken = self._prepared(state, dt, done, number, medium)
+        start = around.start
         if taken:
             changed = self.kernels.run(taken, middle, rows, medium, around, report)
         else:
@@ -310,11 +293,30 @@ class BoundCircuit(BoundEffect):
             cells = [self.cells(middle, rows[k], k, medium=medium, same=same) for k in left]
             changed = self._by_torch(state, start, cells, medium, report, changed, done)
         changed[self.effect.volume_field] = start.half.end
-        exchanged = None if medium is None else medium.exchanged()
-        state = state.with_fields(**changed) if medium is None else medium.settle(**changed)
-        made = report.report(exchanged)
-        made = made.after(state.reports[self.title]) if done else made
-        return state.replace(reports={**state.reports, self.title: made})
+        return changed
+
+    def _prepared(
+        self, state: State, dt: float, done: int, number: int, medium: Around | None
+    ) -> tuple[State, dict[Kind, Tensor], Surroundings, Taken]:
+        """For `changed`: the state half way, the cells by type, what they begin with, and the steps
+        that kernels take."""
+        now = state.replace(time=state.time + (done + 0.5) * dt)
+        middle, start = self.begun(now, 1.0 / (number - done))
+        rows = {k: x for k in self.rates if (x := cells_of_type(state, k)).numel()}
+        signals, pool = ({}, None) if medium is None else (medium.first, medium.pool)
+        around = Surroundings(start, signals, pool, state.colony_id, state.colony)
+        taken = self.kernels.taken(middle, rows, medium, around) if dt else {}
+        return middle, rows, around, taken
+
+    def prepared(
+        self, state: State, dt: float, done: int, number: int, medium: Ramped, report: Failures
+    ) -> PreparedStep | None:
+        """`changed` made ready to be run again and again, as what the medium holds changes; None
+        where kernels cannot take all of it."""
+        middle, rows, around, taken = self._prepared(state, dt, done, number, medium)
+        if not taken or len(taken) < len(rows):
+            return None
+        return PreparedStep(self, taken, middle, rows, medium, around, report)
 
     def begun(self, state: State, share: float = 1.0) -> tuple[State, Start]:
         """The cells as they are half way through this share of their growth, and what a step begins
@@ -336,7 +338,7 @@ class BoundCircuit(BoundEffect):
         state: State,
         start: Start,
         cells: Sequence[run.CircuitCells],
-        medium: MediumExchange | None,
+        medium: Around | None,
         report: Failures,
         changed: dict[str, Tensor],
         done: int,
@@ -366,7 +368,7 @@ class BoundCircuit(BoundEffect):
                 changed[name] = value if whole else changed[name].index_copy(0, rows, value)
             for name in c.exchanged:
                 assert medium is not None
-                medium.give(name, made.pools[name], made.reservoir.get(name), rows)
+                medium.give(name, made.pools.get(name), made.reservoir.get(name), rows)
         return changed
 
     def cells(
@@ -375,17 +377,19 @@ class BoundCircuit(BoundEffect):
         rows: Tensor,
         kind: Kind,
         *,
-        medium: MediumExchange | None = None,
+        medium: Around | None = None,
         same: Lookup | None = None,
     ) -> run.CircuitCells:
         """The circuit in the cells of one type as they are in this state, half way. same:
         constants, where the circuits of several types share what does not depend on the type."""
         found = {} if medium is None else medium.found
         cells = self._named(state, rows, kind, self.exchanged[kind], found, same=same)
-        if medium is not None:
+        if isinstance(medium, Ramped):
+            cells = dataclasses.replace(cells, ramp=medium.ramp)
+        elif medium is not None:
             pool, away = medium.pool, medium.in_reservoir
             cells = dataclasses.replace(cells, pool=pool, in_reservoir=away)
-        return self._compiled(kind, state, cells)
+        return self._compiled(kind, form_of(medium), state, cells)
 
     def _named(
         self,

@@ -107,9 +107,10 @@ class FirstHalf(_MediumPart):
 
     def numerics(self, dt: float, state: State) -> list[str]:
         often = self.transport.in_turns
-        if self.transport.coupled >= {*self.effect.signals}:
-            return ["nothing: nutrition moves what there is"]
-        whole = len(often | self.transport.coupled) < len(self.effect.signals)
+        coupled = self.transport.coupled
+        if coupled.keys() >= {*self.effect.signals}:
+            return [f"nothing: {' and '.join(dict.fromkeys(coupled.values()))} move all signals"]
+        whole = len(often | coupled.keys()) < len(self.effect.signals)
         first = dt / 2 / self.effect.steps if often else dt / 2
         hours = f"{first:g} h" + (f" or {dt / 2:g} h" if whole and first < dt / 2 else "")
         return [f"over {hours}, by the methods that the main part of transport lists"]
@@ -119,7 +120,10 @@ class FirstHalf(_MediumPart):
 
 
 class BoundMedium(_MediumPart):
-    """Transports signals after exchange with the cells: over the second half of a step, or all."""
+    """Transports signals after exchange with the cells: over the second half of a step, or all.
+    solves_together: whether circuits and transport of what they exchange are one equation."""
+
+    solves_together = False
 
     def declares(self) -> list[Field]:
         first = self.transport.first
@@ -150,16 +154,29 @@ class BoundMedium(_MediumPart):
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         others = [e for e in effects if e.place != self.place and e.stage > BEFORE_CELLS]
         circuits = [e for e in others if e.stage == CIRCUIT]
-        # what acts once in a step finds its signals half way, but for those that nutrition carries
-        known = lambda once: {n for e in once for n in (*e.reads(), *e.writes())}
-        for eater in [e for e in others if e.moves_by(self.transport)]:
-            self.transport.coupled |= {*eater.exchanges()}
-        if any(e.exchanges() for e in circuits):
-            for effect in circuits:
-                effect.turns = self.effect.steps
-            once = known([e for e in others if e.stage < CIRCUIT])
-            names = frozenset(n for n in self.effect.signals if OUTSIDE + n not in once)
-            self.transport.in_turns = names - self.transport.coupled
+        exchanged = lambda by: dict.fromkeys(n for e in by for n in e.exchanges())
+        eaten = exchanged(e for e in others if e not in circuits and e.moves_by(self.transport))
+        given = exchanged(circuits)
+        why = next((why for e in circuits if e.exchanges() and (why := e.why_turns)), "")
+        if both := [n for n in given if n in eaten]:
+            why = f"Nutrition moves {both[0]}, and a circuit exchanges it, too."
+        if why and self.effect.exchange == "together":
+            raise checks.input_error("Medium.exchange", "together", '"turns"', why)
+        joint = bool(given) and not why and self.effect.exchange != "turns"
+        self.solves_together = joint
+        self.transport.coupled = dict.fromkeys(eaten, "nutrition")
+        self.transport.in_turns = frozenset()
+        for effect in circuits:
+            effect.moves_by(self.transport if joint and effect.exchanges() else None)
+            effect.turns = self.effect.steps if given and not joint else 1
+        if joint:
+            self.transport.coupled |= dict.fromkeys(given, "circuits")
+        elif given:
+            # what acts once in a step finds its signals half way, but for a nutrient
+            once = [e for e in others if e.stage < CIRCUIT]
+            known = {n for e in once for n in (*e.reads(), *e.writes())}
+            names = frozenset(n for n in self.effect.signals if OUTSIDE + n not in known)
+            self.transport.in_turns = names - self.transport.coupled.keys()
 
     def step(self, state: State, dt: float) -> State:
         """Transport to the end of the step."""

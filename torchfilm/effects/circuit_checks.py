@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
 from collections.abc import Mapping, Sequence
 from numbers import Integral
 from typing import Any
@@ -11,6 +13,7 @@ from torchfilm.circuits.names import unknown
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.state import PER_CELL, RESERVED
 from torchfilm.tools import checks
+from torchfilm.tools.warn_once import warn
 from torchfilm.values import FORMS
 
 STIFF, LEAP, DIRECT = "rosenbrock", "tau_leap", "direct"
@@ -157,3 +160,24 @@ def diluted_names(
             "Circuit.dilution", given, "True where molecules are counted", "Their number is kept."
         )
     return given
+
+
+def check_read(circuit: Any, read: set[str]) -> None:
+    """Raise InputError for a constant of a circuit that looks like another name, and warn of one
+    that no rate reads."""
+    given = circuit.parameters
+    own = {f.name for f in dataclasses.fields(circuit)}
+    options = sorted(own - {"rates", "species", "parameters"})
+    for name in given:
+        if name in read:
+            continue
+        near = difflib.get_close_matches(name, options, 1, 0.75)
+        if near:
+            raise checks.InputError(
+                f"Circuit.{name} is a constant that no rate reads. Did you mean the option"
+                f" {near[0]}?"
+            )
+        known = [n for n in read if n not in given]
+        like = difflib.get_close_matches(name, known, 1)
+        hint = f". Did you mean {like[0]!r}?" if like else f": remove it, or use it as p.{name}."
+        warn(f"Circuit.{name} is a constant that no rate reads{hint}")

@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchfilm.circuits import run
+from torchfilm.circuits import failures, run
 from torchfilm.circuits.dilution import Start
 from torchfilm.effect import Concern
 from torchfilm.medium_exchange import Exchanged
@@ -26,12 +26,16 @@ LOOK, LASTING = 8, 5
 class CircuitReport:
     """`status` (B,): 0, or 1 where a cell's circuit could not be stepped, and `words`, by place in
     the batch, what happened there. steps, (N,) int64: how many steps each cell's circuit took.
-    exchanged: what cells gave to the medium; None without one."""
+    exchanged: what cells gave to the medium; None without one. Where exchange and transport are
+    solved together, (B,) each: the iterations; and what cells took of signals beyond what there
+    was, conc·µm³, as it may be within the circuits' tolerance."""
 
     status: Tensor
     steps: Tensor
     words: Mapping[int, str]
     exchanged: Exchanged | None = None
+    iterations: Tensor | int = 0
+    overdrawn: Tensor | float = 0.0
     hint = (
         "Look at the signs of the rates (none may be below 0 where its species is 0), at their"
         " units (per hour), and at whether they stay finite; a smaller dt may help"
@@ -48,6 +52,22 @@ class CircuitReport:
             steps=earlier.steps + self.steps,
             words={**self.words, **earlier.words},
             exchanged=self.exchanged and self.exchanged.after(earlier.exchanged),
+            iterations=earlier.iterations + self.iterations,
+            overdrawn=earlier.overdrawn + self.overdrawn,
+        )
+
+    def or_else(self, other: CircuitReport, where: Tensor, colony: Tensor) -> CircuitReport:
+        """This report, or in the colonies `where` (B,) another one. colony: of each cell, (N,)."""
+        places = set(torch.nonzero(where).squeeze(1).tolist())
+        assert isinstance(self.iterations, Tensor) and isinstance(self.overdrawn, Tensor)
+        return replace(
+            self,
+            status=torch.where(where, other.status, self.status),
+            steps=torch.where(where.index_select(0, colony), other.steps, self.steps),
+            words={k: w for k, w in self.words.items() if k not in places}
+            | {k: w for k, w in other.words.items() if k in places},
+            iterations=torch.where(where, other.iterations, self.iterations),
+            overdrawn=torch.where(where, other.overdrawn, self.overdrawn),
         )
 
     @property
@@ -106,7 +126,7 @@ class Failures:
         for place in sorted(set(owner)):
             mine = [k for k, o in zip(at.tolist(), owner, strict=True) if o == place]
             row = int(cells.rows[mine[0]])
-            said = run.words(cells, int(code[mine[0]]), begin, mine[0], self.method, self.dt)
+            said = failures.words(cells, int(code[mine[0]]), begin, mine[0], self.method, self.dt)
             kind = (
                 f" (type {int(state.fields['cell_type'][row])})"
                 if "cell_type" in state.fields
@@ -115,6 +135,12 @@ class Failures:
             more = f"; and {len(mine) - 1} more cell(s)" if len(mine) > 1 else ""
             text = f"circuit of cell {int(state.uid[row])}{kind}: {said}{more}"
             self.words[place] = min((row, text), self.words.get(place, (row, text)))
+            self.status[place] = 1
+
+    def note_colonies(self, failed: Tensor, said: str) -> None:
+        """failed: (B,) bool, colonies of which that is said."""
+        for place in torch.nonzero(failed).squeeze(1).tolist():
+            self.words.setdefault(place, (0, said))
             self.status[place] = 1
 
     def _steps(self) -> Tensor:

@@ -198,9 +198,11 @@ class _BoundGrowth(BoundEffect):
         given = [] if rate is None or not bool(numbers(rate).any()) else ["Growth.rate"]
         sources = [*given, *self.setters]
         if len(sources) > 1:
+            first = "Growth.rate is that of first cells only, and " if given else ""
             warn(
-                f"{' and '.join(sources)} each set growth_rate, whatever it was before: the one"
-                " that acts last overrides the others. Keep one of them"
+                f"{' and '.join(sources)} each set growth_rate, whatever it was before: {first}the"
+                " one that acts last overrides the others, also in steps in which it does not set"
+                " it. Keep one of them"
                 + (" (such as Growth() without a rate)" if given else "")
                 + ", or let the later one read growth_rate and change it (an effect of your own"
                 " names what it reads in reads())."

@@ -36,6 +36,7 @@ OnGrid = float | Tensor | Callable[[Tensor], Tensor]
 # to velocities (M, 3).
 Flow = Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
 OUTSIDE_CELLS = ("error", "grow", "reservoir")
+EXCHANGES = ("turns", "together")
 SPLITTINGS = ("lie", "strang")
 
 
@@ -101,14 +102,18 @@ class Medium(Effect):
     `reservoir` concentration; the fields NAME_reservoir sum what cells give to it, less what they
     take.
 
-    method: "exponential" (exact if there are no obstacles and flow and decay are uniform),
-    "series" (exact), "implicit" (one solve an axis), "crank_nicolson" (the paper's) or "euler".
-    Default: "exponential" where possible, else "series". splitting: "strang", half of transport
-    before exchange with the cells and half after, or "lie", exchange and then transport. Strang
-    makes the error of the signal many times smaller, for one more transport per step. steps: of
-    transport within one step of the scene. Circuits and transport take turns in each of them: n
-    make the error of exchange n times smaller or better, without a step of growth and contacts
-    more. method and splitting are not for a nutrient: `Monod` moves it, together with uptake.
+    exchange: how circuits and the medium exchange signals. "together": circuits and transport of
+    these signals are one equation over the step, of second order, whatever crosses a membrane or a
+    voxel in seconds. "turns": circuits with a pool for each cell, then transport; of first order,
+    and two to three times as fast. Default: together, but in turns where circuits count molecules.
+    steps: into which exchange and transport divide a step of the scene; growth and contacts do not.
+
+    method: of transport in turns, and of signals that no cell exchanges: "exponential" (exact if
+    there are no obstacles and flow and decay are uniform), "series" (exact), "implicit" (one solve
+    an axis), "crank_nicolson" (the paper's) or "euler". Default: "exponential" where possible, else
+    "series". splitting: of these, "strang", half of transport before the cells and half after, or
+    "lie", cells and then transport. Strang makes the error of the signal many times smaller, for
+    one more transport per step.
     backend: "compiled" kernels or "torch" for transport. Default: compiled where the device is the
     CPU and Numba is there; gradients always by torch.
     """
@@ -126,6 +131,7 @@ class Medium(Effect):
     method: str | None = None
     steps: int = 1
     splitting: str = "strang"
+    exchange: str | None = None
     backend: str | None = None
 
     stage = TRANSPORT
@@ -149,12 +155,15 @@ class Medium(Effect):
         method: str | None = None,
         steps: int = 1,
         splitting: str = "strang",
+        exchange: str | None = None,
         backend: str | None = None,
         **signals: Signal,
     ):
         _check_signals(signals)
         low, high, voxel = checked_box(box, spacing, depth, height)
         _check_medium(boundary, outside, grows, method, steps, splitting, obstacles)
+        if exchange is not None:
+            checks.choice("Medium.exchange", exchange, EXCHANGES)
         check_backend("Medium", backend)
         given = {
             "signals": dict(signals),
@@ -170,6 +179,7 @@ class Medium(Effect):
             "method": method,
             "steps": int(steps),
             "splitting": splitting,
+            "exchange": exchange,
             "backend": backend,
         }
         for name, value in given.items():
@@ -272,10 +282,11 @@ class Medium(Effect):
         dt: float,
         state: State,
         exchanged: Collection[str] = frozenset(),
-        coupled: Collection[str] = frozenset(),
+        coupled: Mapping[str, str] | None = None,
     ) -> list[str]:
         """exchanged: the signals that cells and transport move in turns, `steps` of them. coupled:
-        those that nutrition moves, which describes that itself."""
+        those that others move, by whom; these describe it themselves."""
+        coupled = coupled or {}
         assert state.layout is not None
         shape, spacing = state.layout.grid.shape[0].tolist(), state.layout.grid.spacing
         voxels = (
@@ -291,7 +302,7 @@ class Medium(Effect):
         if exchanged and self.steps > 1:
             names = ", ".join(sorted(exchanged))
             lines.append(f"{self.steps} turns of cells and transport in a step, for {names}")
-        lines += [f"{n}: moved by nutrition, together with uptake" for n in sorted(coupled)]
+        lines += [f"{n}: moved together with {coupled[n]}, see there" for n in sorted(coupled)]
         for name, signal in self.signals.items():
             if name in coupled:
                 continue

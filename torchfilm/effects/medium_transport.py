@@ -60,9 +60,9 @@ class Transport:
                 else None
             ),
         }
-        # signals that take turns with circuits, in the medium's steps; that nutrition carries
+        # signals that take turns with circuits, in the medium's steps; that others move, by whom
         self.in_turns: frozenset[str] = frozenset()
-        self.coupled: frozenset[str] = frozenset()
+        self.coupled: dict[str, str] = {}
         self._of_step: dict[Any, Carrier] | None = None
         # weak keys: a grid no longer in use releases its steps
         self.carriers: WeakKeyDictionary[Grid, dict[Any, Carrier]] = WeakKeyDictionary()
@@ -110,7 +110,7 @@ class Transport:
         assert state.layout is not None
         grid, steps = state.layout.grid, self.medium.steps
         changed = {}
-        for name in sorted(self.signals.keys() - self.coupled if names is None else names):
+        for name in sorted(self.signals.keys() - self.coupled.keys() if names is None else names):
             often = name in self.in_turns
             whole, count = (turn, pieces) if often else (hours, steps)
             count = 1 if often and self.medium.method_of(name)[0] in EXACT else count

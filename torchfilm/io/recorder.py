@@ -121,6 +121,11 @@ class Recorder(metaclass=checks.KnownKeywords):
                 "the Recorder was made for another scene than the one that runs: its file would"
                 " describe the wrong one."
             )
+        if self.written > -1 and not self.append:
+            raise checks.InputError(
+                f"this Recorder has written a run to {self.path}. A Recorder writes one run; make"
+                " another for the next, or give Recorder(…, append=True) to go on in its file."
+            )
         self.model, self.dt = model, dt
 
     def __call__(self, state: State) -> None:

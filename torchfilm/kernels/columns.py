@@ -84,8 +84,7 @@ def store(first, last, rows, at, start, pool, thinner, diluted, signals, report,
             gain = number(at[m, size + e]) - number(start[e, m])
             given[signals[e], n] = gain * pool[n]
             if back.shape[0]:
-                up, down = at[m, size + count + e], at[m, size + 2 * count + e]
-                back[signals[e], n] = number(up) - number(down)
+                back[signals[e], n] = number(at[m, size + count + e])
         steps[n] = report[0, m] + report[1, m]
 
 

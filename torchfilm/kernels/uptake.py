@@ -13,7 +13,7 @@ from torchfilm.kernels.transport import exchanged
 from torchfilm.kernels.transport_solve import backward_euler, dot, product
 
 # As in `tools.fixed_point`.
-DEPTH, RIDGE, TINY = 3, 1e-12, 1e-300
+DEPTH, RIDGE, TINY, WORSE = 3, 1e-12, 1e-300, 4.0
 # The error of a solve is at most this part of the least half; FINEST: its least relative residual.
 HUNGER, FINEST = 1e-4, 1e-14
 
@@ -99,6 +99,23 @@ def series(u, pad, grid, weights, tails, used, gained, times, end, mean, spare):
 
 
 @kernel
+def with_losses(dt, operator, room, settings):
+    """The greatest rate at which a voxel of a grid loses, with the losses in room; λ; and the
+    operator at this λ, which uses `still` of the room."""
+    strides, stay, ups, downs, wrap_to, wrap_from, wraps, rate, _ = operator
+    loss, still, mixed, fastest = room[0], room[1], room[8], 0.0
+    for i in range(loss.size):
+        still[i] = (1 - stay[i]) * rate + loss[i]
+        fastest = max(fastest, still[i])
+    at = settings[0] * fastest if fastest > 0 else 1.0
+    scale = rate / at
+    for i in range(loss.size):
+        still[i] = 1 - still[i] / at
+    grid = strides, still, ups * scale, downs * scale, wrap_to, wrap_from, wraps * scale, mixed
+    return fastest, at, grid
+
+
+@kernel
 def carry_once(u, more, dt, pad, operator, room, far, least, settings):
     """One grid over dt hours with the losses in `room`: its end and mean go to room. Whether the
     solve converged, and whether it was one of backward Euler, which it stays once it is `far`.
@@ -106,19 +123,11 @@ def carry_once(u, more, dt, pad, operator, room, far, least, settings):
     u: (voxels,). more: gain, 1/h, or empty. least: of `half`. operator: strides … wraps of one
     colony, its λ, and whether there is no flow.
     """
-    strides, stay, ups, downs, wrap_to, wrap_from, wraps, rate, symmetric = operator
-    loss, still, x, r, b, final, mean, spare, mixed, weights, tails = room
-    above, cut, events, tolerance, rounding, most = settings
-    fastest = 0.0
-    for i in range(u.size):
-        still[i] = (1 - stay[i]) * rate + loss[i]
-        fastest = max(fastest, still[i])
-    at = above * fastest if fastest > 0 else 1.0
-    times, scale = at * dt, rate / at
+    _, _, x, r, b, final, mean, spare, _, weights, tails = room
+    _, cut, events, tolerance, rounding, most = settings
+    fastest, at, grid = with_losses(dt, operator, room, settings)
+    times, symmetric = at * dt, operator[8]
     far = far or times > events
-    for i in range(u.size):
-        still[i] = 1 - still[i] / at
-    grid = strides, still, ups * scale, downs * scale, wrap_to, wrap_from, wraps * scale, mixed
     if not far:
         used = poisson(times, cut, weights, tails)
         series(u, pad, grid, weights, tails, used, more / at, times, final, mean, spare)
@@ -155,27 +164,40 @@ def solve_mixed(matrix, right, count):
 
 
 @kernel
-def next_guess(mean, new, before, changes, matrix, right, half, fed, close, done_before):
+def next_guess(mean, new, memory, changes, matrix, right, half, fed, close, lost, control):
     """One iteration of all cells of a colony, as `tools.fixed_point`: the next mean, in place.
-    Whether all were close, and whether all are within 100 times that.
+    Whether all were close, and whether none is lost.
 
-    before: (2, cells), the last value and residual. changes: (DEPTH, 2, cells), the last changes of
-    them, in a ring.
+    memory: (4, cells), the last value and residual, and the best guess and its value. changes:
+    (DEPTH, 2, cells), the last changes of value and residual, in a ring. control: iterations since
+    the history began, the least residual squared, and the part of a step that is taken from the
+    best guess; it begins as (0, ∞, 1).
     """
-    done, near = True, True
+    done, near, size = True, True, 0.0
     for i in range(mean.size):
         new[i] = new[i] if fed[i] else mean[i]
         off = abs(new[i] - mean[i]) / (half[i] + mean[i])
-        near = near and off <= 100 * close
+        near = near and off <= lost
         done = done and not off > close  # a NaN stays one
+        size += off * off
     if done:
         return done, near
-    count = min(done_before, DEPTH)
-    if count > 0:
-        slot = (done_before - 1) % DEPTH
+    if not size <= WORSE * control[1]:  # begin again from the best guess, more carefully
+        control[0], control[2] = 0, 0.5 * control[2]
         for i in range(mean.size):
-            changes[slot, 0, i] = new[i] - before[0, i]
-            changes[slot, 1, i] = new[i] - mean[i] - before[1, i]
+            mean[i] = memory[2, i] + control[2] * (memory[3, i] - memory[2, i])
+        return done, near
+    if size < control[1]:
+        control[1], control[2] = size, min(1.0, 2 * control[2])
+        for i in range(mean.size):
+            memory[2, i], memory[3, i] = mean[i], new[i]
+    age = int(control[0])
+    control[0], count = age + 1, min(age, DEPTH)
+    if count > 0:
+        slot = (age - 1) % DEPTH
+        for i in range(mean.size):
+            changes[slot, 0, i] = new[i] - memory[0, i]
+            changes[slot, 1, i] = new[i] - mean[i] - memory[1, i]
     for a in range(count):
         for b in range(a, count):
             total = 0.0
@@ -189,10 +211,12 @@ def next_guess(mean, new, before, changes, matrix, right, half, fed, close, done
             right[a] += changes[a, 1, i] * weight * ((new[i] - mean[i]) * weight)
     solve_mixed(matrix, right, count)
     for i in range(mean.size):
-        before[0, i], before[1, i] = new[i], new[i] - mean[i]
-        ahead = new[i]
+        memory[0, i], memory[1, i] = new[i], new[i] - mean[i]
+        ahead, left = new[i], new[i] - mean[i]
         for a in range(count):
             ahead -= right[a] * changes[a, 0, i]
+            left -= right[a] * changes[a, 1, i]
+        ahead -= (1 - control[2]) * left
         mean[i] = ahead if ahead > 0 else new[i]
     return done, near
 
@@ -206,7 +230,8 @@ def eat_grid(u, more, dt, pad, operator, room, cells, place, found, out, setting
     close, most, rest = settings
     size, last = found.size, first + found.size
     mean, new, taking = found.copy(), np.empty(size), np.empty(size)
-    before, changes = np.empty((2, size)), np.empty((DEPTH, 2, size))
+    memory, changes = np.zeros((4, size)), np.empty((DEPTH, 2, size))
+    control = np.array([0.0, np.inf, 1.0])
     matrix, right = np.empty((DEPTH, DEPTH)), np.empty(DEPTH)
     far, good, near, count, least = False, True, True, 0, np.inf
     for i in range(first, last):
@@ -214,11 +239,14 @@ def eat_grid(u, more, dt, pad, operator, room, cells, place, found, out, setting
     while True:
         put_taking(taking, mean, cells)
         put_losses(room[0], taking, node, weight, start, voxel_volume)
+        before = far
         good, far = carry_once(u, more, dt, pad, operator, room, far, least, rest)
+        if far != before:  # another equation: what is known of the first says nothing
+            control[0], control[1], control[2] = 0.0, np.inf, 1.0
         put_read(new, room[6], node, weight, start)
         done, near = next_guess(
-            mean, new, before, changes, matrix, right, half[first:last], fed[first:last], close,
-            count,
+            mean, new, memory, changes, matrix, right, half[first:last], fed[first:last], close,
+            100 * close, control,
         )  # fmt: skip
         count += 1
         if done or count == most or not good:

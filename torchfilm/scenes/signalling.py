@@ -41,7 +41,6 @@ def quorum_sensing(
     rate: float = 1.0,
     size: float = 128.0,
     spacing: float = 4.0,
-    steps: int = 4,
     length_drag: float = 10.0,
 ) -> Scene:
     """Lux quorum sensing (Table 2): together the cells make enough AHL to switch LuxI on.
@@ -52,9 +51,6 @@ def quorum_sensing(
     dilution of LuxI is faster than its induction, and nothing switches. With the constants here it
     switches, the sooner the smaller the box.
 
-    AHL crosses membranes in seconds: circuits and transport take `steps` turns in a step, without
-    which AHL in the cells would be 7 % too high (now 1 %).
-
     Pressure limits growth (length_drag 10, the paper's): the constants are for its dilution.
     """
     half = size / 2
@@ -64,10 +60,7 @@ def quorum_sensing(
         Mechanics(dim=2, length_drag=length_drag),
         Circuit(_lux, species=("luxi", "ahl"), D1=D1, d2=d2, k1=k1, k2=k2, k3=k3, k4=k4, g1=g1),
         Medium(
-            ahl=Signal(diffusion=diffusion),
-            box=((-half, -half), (half, half)),
-            spacing=spacing,
-            steps=steps,
+            ahl=Signal(diffusion=diffusion), box=((-half, -half), (half, half)), spacing=spacing
         ),
     )
 

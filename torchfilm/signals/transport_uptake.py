@@ -51,15 +51,19 @@ class UptakeTransport:
         return given + [x for axis in axes for x in (axis.up, axis.down)]
 
     def step(
-        self, u: Tensor, loss: Tensor, dt: float, far: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
+        self, u: Tensor, loss: Tensor, dt: float, far: Tensor | None = None,
+        given: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         """u (b, nx, ny, nz) after dt hours, its mean over them, both float64, and `far`. loss: (b,
-        nx, ny, nz) float64, 1/h.
+        nx, ny, nz) float64, 1/h. given: what cells give, conc/h, of the same shape.
 
         far: (b,) bool, colonies that take backward Euler though they could take the series. NaN
         where a solve did not converge.
         """
         operator = replace(self.operator, decay=self.operator.decay + loss)
+        if given is not None:
+            source = operator.source
+            operator = replace(operator, source=given if source is None else source + given)
         u = u.double()
         fastest = both(operator.loss.detach())[0].flatten(1).amax(1)
         rate = torch.where(fastest > 0, ABOVE * fastest, 1.0).expand(u.shape[0])

@@ -25,9 +25,9 @@ from torchfilm.signals.compiled import may_run
 from torchfilm.signals.grid import Grid
 from torchfilm.signals.stencil import Stencil
 from torchfilm.signals.transport_uptake import UptakeTransport
-from torchfilm.tools.fixed_point import fixed_point
+from torchfilm.tools.fixed_point import fixed_point, with_derivative
 from torchfilm.tools.ragged import Groups
-from torchfilm.tools.tangents import both, refuse_second, tracked, with_tangent
+from torchfilm.tools.tangents import both, tracked
 
 # Of the mean concentration, relative to half + s̄, where iteration ends. MOST: iterations; hard
 # cases take some twenty.
@@ -103,7 +103,9 @@ def solve(
         )  # fmt: skip
     mean = fixed.x
     if tracked(field, found, *numbers, *(x for one in carried for x in one.numbers())):
-        mean = _with_derivative(step, mean, eaters.groups)
+        mean = with_derivative(
+            lambda x: step(x)[1], mean, eaters.groups, CLOSE, MOST, "uptake of a nutrient"
+        )
     taking = eaters.taking(mean)
     end, new = step(mean)
     amount = torch.where(
@@ -136,54 +138,3 @@ class _Step:
             means.append(average)
         read = eaters.read(grid.join(means))
         return grid.join(ends), torch.where(eaters.fed, read, self.found)
-
-
-def _with_derivative(step: _Step, mean: Tensor, groups: Groups) -> Tensor:
-    """The solution s̄ = F(s̄), with the derivative of this equation: ds̄ = (1 − F′)⁻¹ dF."""
-    moved = both(step(mean)[1])[1]
-    if moved is not None:  # F′ of a tangent, and the tangent of F itself, together
-        size = _sizes(moved, groups)
-        turned = fixed_point(
-            lambda x: _zero_if_none(both(step(with_tangent(mean, x))[1])[1], x), moved,
-            lambda x: size, groups, CLOSE, MOST,
-        )  # fmt: skip
-        failed = turned.failed.index_select(0, groups.owner)
-        return with_tangent(mean, torch.where(failed, torch.nan, turned.x))
-    change = step(mean)[1] - mean
-    return _Adjoint.apply(change, mean, step, groups) if change.requires_grad else mean
-
-
-class _Adjoint(torch.autograd.Function):
-    """s̄, with the derivative (1 − F′)⁻¹ d(change). Its input is the change F(s̄) − s̄ ≈ 0 at a
-    constant s̄."""
-
-    @staticmethod
-    def forward(ctx, change: Tensor, mean: Tensor, step: _Step, groups: Groups) -> Tensor:
-        ctx.step, ctx.groups = step, groups
-        ctx.save_for_backward(mean)
-        return mean.clone()
-
-    @staticmethod
-    def backward(ctx, grad: Tensor):
-        refuse_second("uptake of a nutrient")
-        with torch.enable_grad():
-            at = ctx.saved_tensors[0].detach().requires_grad_()
-            value = ctx.step(at)[1]
-
-        def pulled(x: Tensor) -> Tensor:
-            back = torch.autograd.grad(value, at, x, retain_graph=True, allow_unused=True)[0]
-            return grad + _zero_if_none(back, x)
-
-        size = _sizes(grad, ctx.groups)
-        found = fixed_point(pulled, grad, lambda x: size, ctx.groups, CLOSE, MOST)
-        failed = found.failed.index_select(0, ctx.groups.owner)
-        return torch.where(failed, torch.nan, found.x), None, None, None
-
-
-def _zero_if_none(given: Tensor | None, like: Tensor) -> Tensor:
-    return torch.zeros_like(like) if given is None else given
-
-
-def _sizes(values: Tensor, groups: Groups) -> Tensor:
-    """The greatest size of each group, for each of its numbers."""
-    return groups.max(values.abs()).index_select(0, groups.owner).clamp(min=1e-300)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 
 import torch
@@ -37,9 +37,22 @@ def _prepare_forward_mode() -> None:
             forward_ad.make_dual(torch.ones(1), torch.ones(1)).exp()
 
 
+def outside_checkpoints() -> AbstractContextManager[object]:
+    """Within it, what torch saves for a backward pass is not for a checkpoint that is under way:
+    where the pass is done at once, or the work is done once and not again for a checkpoint."""
+    return torch.autograd.graph.saved_tensors_hooks(lambda x: x, lambda x: x)
+
+
+@contextmanager
+def no_derivatives() -> Iterator[None]:
+    """Within it results carry neither gradients nor tangents, and no derivative is wanted."""
+    with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False):
+        yield
+
+
 def in_forward_mode() -> bool:
     """Whether a tensor may carry a tangent now."""
-    return forward_ad._current_level >= 0
+    return forward_ad._current_level >= 0 and torch._C._is_fwd_grad_enabled()
 
 
 def tangent(value: Tensor) -> Tensor | None:

@@ -1,0 +1,275 @@
+"""Circuits and transport of what they exchange in one equation: `Medium(exchange="together")`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from exchanging_cells import BOX, F64, advance, exchanging, resting, totals
+from helpers import step
+from scipy.integrate import solve_ivp
+
+import torchfilm as tf
+from torchfilm.signals.exchange import stencil
+from torchfilm.tools.tangents import forward_mode, tangent, with_tangent
+
+DT = 0.05
+SIX = tf.Cells(
+    [[0.0, 0.0], [3.0, 1.0], [-2.0, 4.0], [1.0, -5.0], [1.5, 0.0], [9.0, 9.0]],
+    [[1.0, 0.0]] * 6,
+    2.0,
+)
+TIGHT = {"rtol": 1e-8, "atol": 1e-10}
+
+
+def medium(diffusion=30.0, decay=0.5, **options) -> tf.Medium:
+    given = {"box": BOX, "spacing": 4.0, "exchange": "together", **options}
+    return tf.Medium(ahl=tf.Signal(diffusion, decay=decay), **given)
+
+
+def lux(u, s, p, cell):
+    """Made where there is some already, and exchanged."""
+    into = p.D1 * (s.ahl - u.ahl) * cell.area
+    made = 1.0 + 0.2 * cell.x + p.gain * u.ahl**2 / (1 + u.ahl**2)
+    return {"ahl": made + into / cell.volume}, {"ahl": -into}
+
+
+def talking(D1=10.0, gain=20.0, cells=SIX, circuit=None, **options) -> tf.Scene:
+    given = {**TIGHT, "D1": D1, "gain": gain, **(circuit or {})}
+    return resting(medium(**options), tf.Circuit(lux, species="ahl", **given), cells)
+
+
+def exact(state: tf.State, D1: float, gain: float, diffusion: float, hours: float):
+    """Species and field after so many hours by an implicit integrator at 1e-10: voxels and cells in
+    one system of equations. The faces let nothing pass."""
+    grid = state.layout.grid
+    shape, h = grid.shapes[0], grid.spacing[0]
+    at = stencil(grid, state.position_3d, state.colony)
+    node, weight = at.node.numpy(), at.weight.double().numpy()
+    area, volume = state.area.numpy(), state.volume.numpy()
+    count, x = len(volume), state.position[:, 0].numpy()
+
+    def rates(t, y):
+        field, ahl = y[:-count].reshape(shape), y[-count:]
+        change = -0.5 * field
+        for axis in range(3):
+            flux = np.diff(field, axis=axis) * diffusion / h**2
+            pad = [(1, 1) if k == axis else (0, 0) for k in range(3)]
+            change += np.diff(np.pad(flux, pad), axis=axis)
+        change = change.reshape(-1)
+        here = (weight * y[:-count][node]).sum(1)
+        into = D1 * (here - ahl) * area
+        share = weight * np.where(
+            (into > 0)[:, None], y[:-count][node] / np.maximum(here, 1e-300)[:, None], 1.0
+        )
+        np.subtract.at(change, node, share * (into / grid.voxel_volume)[:, None])
+        made = 1.0 + 0.2 * x + gain * ahl**2 / (1 + ahl**2)
+        return np.concatenate([change, made + into / volume])
+
+    start = np.concatenate([state.signals["ahl"].numpy(), state.ahl.numpy()])
+    found = solve_ivp(rates, (0, hours), start, method="LSODA", rtol=1e-10, atol=1e-13)
+    return found.y[-count:, -1], found.y[:-count, -1]
+
+
+@pytest.mark.parametrize(("diffusion", "D1"), [(0.0, 10.0), (30.0, 1.0), (100.0, 1e3), (1e3, 30.0)])
+def test_order_two_where_the_series_carries(diffusion, D1):
+    """Against one system of equations of voxels and cells, also where a cell exchanges itself tens
+    of times in a step, and two cells sit in one voxel."""
+    first = talking().bind(dtype=F64).start()
+    ahl, field = exact(first, D1, 20.0, diffusion, 0.4)
+    errors = []
+    for parts in (8, 16, 32):
+        made = talking(D1=D1, diffusion=diffusion)
+        end = advance(made, made.bind(dtype=F64).start(), parts, 0.4 / parts)
+        off = (end.ahl.numpy() - ahl, end.signals["ahl"].numpy() - field)
+        errors.append(
+            max(np.abs(x).max() / x0.max() for x, x0 in zip(off, (ahl, field), strict=True))
+        )
+    assert errors[0] < 1e-2
+    assert errors[2] < errors[1] / 2.5 < errors[0] / 6
+
+
+@pytest.mark.parametrize("D1", [1.0, 1e4])
+@pytest.mark.parametrize("diffusion", [1e5, 2e6])
+def test_where_both_are_fast(diffusion, D1):
+    """Real signals cross a colony in a second, and a membrane in less: then both follow at once,
+    whatever the step."""
+    first = talking().bind(dtype=F64).start()
+    ahl, field = exact(first, D1, 20.0, diffusion, 0.4)
+    made = talking(D1=D1, diffusion=diffusion)
+    end = advance(made, made.bind(dtype=F64).start(), 8, 0.05)
+    # the field is that of what cells gave half a step before: at 0.4 h, 1.2 % of what has grown
+    np.testing.assert_allclose(end.ahl.numpy(), ahl, rtol=1.5e-2)
+    np.testing.assert_allclose(end.signals["ahl"].numpy(), field, rtol=1.5e-2)
+
+
+@pytest.mark.parametrize("diffusion", [0.0, 100.0, 2e6])
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_amounts_are_kept_to_rounding(diffusion, dtype):
+    """Whatever the tolerance of the iteration, and also where cells take all there is."""
+    cells, fast = (
+        resting(medium(diffusion, 0.0), exchanging(5.0, D1=1e4), SIX),
+        1e-6 if dtype == torch.float32 else 1e-9,
+    )
+    start = cells.bind(dtype=dtype).start()
+    end = advance(cells, start, 10, DT)
+    assert float(totals(end)) == pytest.approx(float(totals(start)), rel=fast)
+    assert float(end.signals["ahl"].min()) >= 0 and float(end.ahl.min()) >= 0
+
+
+@pytest.mark.parametrize("diffusion", [10.0, 1e5])
+def test_a_steady_state_does_not_depend_on_the_step(diffusion):
+    ends = []
+    for dt in (0.2, 0.05):
+        made = talking(diffusion=diffusion)
+        ends.append(advance(made, made.bind(dtype=F64).start(), round(40 / dt), dt))
+    for name in ("ahl", "out.ahl"):
+        torch.testing.assert_close(ends[0].fields[name], ends[1].fields[name], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("circuit", [{}, {"method": "rk4", "steps": 40}])
+@pytest.mark.parametrize("diffusion", [30.0, 1e5])
+def test_both_backends(circuit, diffusion):
+    ends = []
+    for backend in ("compiled", "torch"):
+        given = {**circuit, "backend": backend}
+        made = talking(circuit=given, diffusion=diffusion, backend=backend)
+        ends.append(advance(made, made.bind(dtype=F64).start(), 3, DT))
+    for name in ("ahl", "out.ahl"):
+        torch.testing.assert_close(
+            ends[0].fields[name], ends[1].fields[name], rtol=1e-9, atol=1e-12
+        )
+
+
+@pytest.mark.parametrize("diffusion", [30.0, 1e5])
+def test_parts_of_a_step_are_steps_of_the_scene(diffusion):
+    often, short = talking(diffusion=diffusion, steps=4), talking(diffusion=diffusion)
+    once = advance(often, often.bind(dtype=F64).start(), 3, DT)
+    each = advance(short, short.bind(dtype=F64).start(), 12, DT / 4)
+    for name in ("ahl", "out.ahl"):
+        torch.testing.assert_close(once.fields[name], each.fields[name], rtol=1e-9, atol=1e-12)
+    report = once.reports["circuit"]
+    assert int(report.iterations) >= 8 and report.exchanged is None
+
+
+@pytest.mark.parametrize("diffusion", [30.0, 1e5])
+def test_the_same_bits_in_any_batch(diffusion):
+    """A colony that needs more iterations leaves the others alone."""
+    fast = torch.tensor([1.0, 1e3, 10.0], dtype=F64)
+    made = talking(D1=fast, diffusion=diffusion)
+    model = made.bind(colonies=3, dtype=torch.float32)
+    together = advance(made, model.start(), 4, DT)
+    for k in range(3):
+        alone = model.start().select([k])
+        end = advance(made, alone, 4, DT)
+        mine = together.colony == k
+        assert torch.equal(end.ahl, together.ahl[mine])
+
+
+def reading(u, s, p, cell):
+    return {"seen": s.ahl - u.seen}
+
+
+def test_a_circuit_that_only_reads_finds_the_signal_half_way():
+    """So that it is of second order, too."""
+    ends = []
+    for parts in (8, 16, 64):
+        made = tf.Scene(
+            tf.Circuit(lux, species="ahl", D1=10.0, gain=20.0, name="A", **TIGHT),
+            tf.Circuit(reading, species="seen", name="B", **TIGHT),
+            medium(), founders=SIX,
+        )  # fmt: skip
+        ends.append(advance(made, made.bind(dtype=F64).start(), parts, 0.4 / parts).B_seen)
+    assert (ends[0] - ends[2]).abs().max() > 3 * (ends[1] - ends[2]).abs().max() > 1e-9
+
+
+def test_cells_in_a_reservoir_and_signals_without_cells():
+    """What cells beyond the box give goes to the reservoir; colonies without cells diffuse."""
+    made = resting(
+        medium(outside="reservoir", decay=0.0), exchanging(4.0, D1=2.0),
+        tf.Cells([[0.0, 0.0], [30.0, 0.0]], [[1.0, 0.0]] * 2, 2.0),
+    )  # fmt: skip
+    start = made.bind(dtype=F64).start()
+    end = advance(made, start, 5, DT)
+    assert float(end.ahl_reservoir) > 1.0
+    assert float(totals(end)) == pytest.approx(float(totals(start)), rel=1e-9)
+    left = end.remove(torch.ones(2, dtype=torch.bool), "left")
+    after = advance(made, left, 5, DT)
+    assert after.signals["ahl"].max() < left.signals["ahl"].max()
+    assert float(after.signals["ahl"].sum()) == pytest.approx(float(left.signals["ahl"].sum()))
+
+
+@pytest.mark.parametrize("exchange", ["turns", "together"])
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_a_reservoir_of_nothing_takes_from_cells_that_had_nothing(exchange, backend):
+    """At first nothing passes, in either direction."""
+    circuit = tf.Circuit(lux, species="ahl", D1=10.0, gain=20.0, backend=backend)
+    made = resting(
+        medium(outside="reservoir", exchange=exchange), circuit,
+        tf.Cells([[30.0, 0.0]], [[1.0, 0.0]], 2.0),
+    )  # fmt: skip
+    end = advance(made, made.bind().start(), 4, DT)
+    assert float(end.ahl_reservoir) > 0.1
+
+
+def greedy(u, s, p, cell):
+    return {"ahl": 100.0 / cell.volume}, {"ahl": -100.0}
+
+
+def test_cells_that_take_what_is_not_there_are_named():
+    made = resting(medium(), tf.Circuit(greedy, species="ahl"), SIX)
+    with pytest.raises(tf.SimulationError, match="cells take more of a signal than there is"):
+        for _ in tf.simulate(made, until=0.2):
+            pass
+
+
+def test_counted_molecules_take_turns():
+    reactions = [
+        tf.Reaction({}, {"ahl": 1}, rate=10.0),
+        tf.Reaction({"ahl": 1}, {"out.ahl": 1}, rate=1.0),
+    ]
+    circuit = tf.Circuit(reactions, species="ahl", method="tau_leap")
+    with pytest.raises(tf.InputError, match="makes amounts that jump"):
+        resting(medium(), circuit, SIX).bind()
+
+
+def test_a_nutrient_that_circuits_exchange_takes_turns():
+    def fed(u, s, p, cell):
+        return {"food": 0.0 * u.food}, {"food": 0.1}
+
+    made = tf.Scene(
+        tf.Monod("food"), tf.Growth(), tf.Circuit(fed, species="food"),
+        tf.Medium(food=tf.Signal(10.0, initial=1.0), box=BOX, spacing=4.0, exchange="together"),
+        founders=SIX,
+    )  # fmt: skip
+    with pytest.raises(tf.InputError, match="Nutrition moves food, and a circuit exchanges it"):
+        made.bind()
+
+
+@pytest.mark.parametrize("diffusion", [30.0, 1e5])
+@pytest.mark.parametrize("backend", [None, "torch"])
+def test_derivatives(diffusion, backend):
+    """Backward pass and forward mode against differences, by constants of cells and of
+    transport."""
+
+    def outcome(x):
+        circuit = {"rtol": 0.05, "atol": 0.05, "backend": backend}
+        made = talking(D1=10.0 * x, gain=20.0 * x, circuit=circuit, diffusion=diffusion * x)
+        state = made.bind(dtype=F64).start()
+        for _ in range(3):
+            state = step(made, state, 0.01)
+        assert int(state.reports["circuit"].steps.max()) == 1
+        return (state.ahl * torch.arange(1.0, 7.0)).sum() + state.signals["ahl"][:9].sum()
+
+    at = torch.tensor(1.0, dtype=F64, requires_grad=True)
+    outcome(at).backward()
+    with forward_mode():
+        forward = tangent(
+            outcome(with_tangent(torch.tensor(1.0, dtype=F64), torch.tensor(1.0, dtype=F64)))
+        )
+    ahead, back = (
+        outcome(torch.tensor(1.0 + h, dtype=F64, requires_grad=True)) for h in (1e-4, -1e-4)
+    )
+    slope = float(ahead.detach() - back.detach()) / 2e-4
+    assert float(at.grad) == pytest.approx(slope, rel=1e-5)
+    assert float(forward) == pytest.approx(slope, rel=1e-5)

@@ -1,0 +1,61 @@
+"""How a circuit is computed, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from torchfilm.parameters import number_range
+from torchfilm.signals.compiled_uptake import EVENTS
+from torchfilm.values import numbers
+
+if TYPE_CHECKING:
+    from torchfilm.effects.circuit import Circuit
+
+
+def methods_of(
+    circuit: Circuit, dt: float, turns: int, why_torch: Sequence[str], exchanged: Sequence[str]
+) -> list[str]:
+    """Lines on the method, on who computes it, and on the signals that take turns with it."""
+    molecules = (
+        f"{number_range(numbers(circuit.molecules_per_unit))} molecules in a unit of concentration"
+        " × µm³; no gradient"
+    )
+    said = {
+        "rosenbrock": (
+            "stiff solver (Rodas3), each cell in steps of its own: error at most"
+            f" {circuit.atol:g} + {circuit.rtol:g}·|u| in each; nothing below 0"
+        ),
+        "tau_leap": f"molecule by molecule, tau-leaping (ε = 0.03), {molecules}",
+        "direct": f"molecule by molecule, one event after the other, {molecules}",
+    }
+    count = circuit.steps * turns
+    explicit = (
+        f"{circuit.method}, {count} equal step(s) of {dt / count:g} h; nothing controls its error"
+    )
+    lines = [said.get(circuit.method, explicit)]
+    why = [f"computed by torch: {x}" for x in why_torch]
+    lines += why or ["computed by compiled functions of its equations"]
+    if exchanged:
+        lines.append(
+            f"exchanges {', '.join(exchanged)} with each cell's own pool: amounts kept to rounding;"
+            f" first order in dt{f'/{turns}' if turns > 1 else ''}"
+        )
+    return lines
+
+
+def together_lines(exchanges: Mapping[str, float]) -> list[str]:
+    """Lines on signals whose transport is solved together with the circuit. exchanges: how often
+    voxels exchange each in a step."""
+    lines = [
+        f"exchange and transport of {', '.join(exchanges)} in one equation over the step; amounts"
+        " kept to rounding"
+    ]
+    for name, times in exchanges.items():
+        lines.append(
+            f"{name}: transport by backward Euler, order 1: voxels exchange {times:.3g} times a"
+            f" step, over {EVENTS:g}"
+            if times > EVENTS
+            else f"{name}: transport by a series, order 2 in dt"
+        )
+    return lines

@@ -1,0 +1,159 @@
+"""Transport of one signal over a step in which cells give to it and take from it.
+
+What a cell gives over the step, it gives evenly. What it takes is taken in proportion to what is
+there, at the rate at which it takes the wanted amount if the mean concentration about it is as
+guessed: so nothing becomes negative, whatever the guess, and at the right one the cell gets what it
+wanted. With both given, transport is linear (`signals.transport_uptake`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfilm.signals import compiled_uptake
+from torchfilm.signals.compiled import may_run
+from torchfilm.signals.compiled_uptake import CompiledUptake
+from torchfilm.signals.exchange import read, write
+from torchfilm.signals.grid import Grid
+from torchfilm.signals.stencil import Stencil
+from torchfilm.signals.transport_uptake import UptakeTransport
+from torchfilm.tools.ragged import Groups
+from torchfilm.tools.tangents import both, has_tangent, no_derivatives, only_forward, with_tangent
+
+TINY = 1e-300
+# Of the rate at which a cell takes, times the step: it then takes all there is.
+EMPTY = 1e9
+
+
+class Moved(NamedTuple):
+    """end: (voxels,) float64, the signal at the end. at_end, mean: (N,) float64, what each cell
+    finds of it then, and in the mean over the step. taken: (N,), what the medium gave to each."""
+
+    end: Tensor
+    at_end: Tensor
+    mean: Tensor
+    taken: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class JointTransport:
+    """Transport of a signal over `dt` hours about cells in given places.
+
+    carried: on each of `grid.batches`. pool: (N,) µm³, of which each cell may draw all that there
+    is. field: (voxels,). found: (N,) float64, what each cell finds of it at the start; `fed` (N,)
+    bool: cells in the box, the others meet a reservoir of that concentration. groups: of the cells
+    by colony. finest: concentrations that matter no more.
+    """
+
+    grid: Grid
+    carried: Sequence[UptakeTransport]
+    stencil: Stencil
+    pool: Tensor
+    groups: Groups
+    field: Tensor
+    found: Tensor
+    fed: Tensor
+    finest: float
+    dt: float
+
+    @cached_property
+    def _far(self) -> list[Any]:
+        """Of each of `grid.batches`, (b,), the colonies that needed backward Euler: they keep to
+        it, or the two would alternate."""
+        return [None] * len(self.carried)
+
+    @cached_property
+    def turned(self) -> Tensor:
+        """Colonies that have begun to take backward Euler after the first time, (B,) bool: their
+        equation has changed. Whoever looks clears it."""
+        return torch.zeros(self.groups.size, dtype=torch.bool, device=self.field.device)
+
+    @cached_property
+    def operators(self) -> list[CompiledUptake]:
+        """What kernels take of each of `grid.batches`; nothing where they may not run."""
+        found = [x.compiled for x in self.carried if x.compiled is not None]
+        return found if len(found) == len(self.carried) and may_run(self.stencil.weight) else []
+
+    @property
+    def by_kernels(self) -> bool:
+        """Whether kernels may run it, without derivatives by what there was."""
+        return bool(self.operators) and may_run(self.field, self.found)
+
+    def moved(self, released: Tensor, mean: Tensor) -> Moved:
+        """A step. released: (N,), what each cell gives, or takes, conc·µm³. mean: (N,), the guess
+        of the mean concentration about it."""
+        released = released.double()
+        numbers = self.field, self.found, released, mean
+        if self.operators and (may_run(*numbers) or only_forward(*numbers)):
+            return self._by_kernels(released, mean)
+        per_volume = torch.where(self.fed, released / (self.stencil.voxel_volume * self.dt), 0.0)
+        given = self._spread(per_volume.clamp(min=0.0))
+        rate = (-per_volume).clamp(min=0.0) / mean.clamp(min=TINY)
+        rate = rate.clamp(max=EMPTY / self.dt)
+        losses = self._spread(rate)
+        ends, means = [], []
+        for k, (one, batch) in enumerate(zip(self.carried, self.grid.batches, strict=True)):
+            before = self._far[k]
+            end, average, self._far[k] = one.step(
+                batch.of(self.field), batch.of(losses), self.dt, before, batch.of(given)
+            )
+            if before is not None:
+                self.turned[batch.colonies] |= self._far[k] & ~before
+            ends.append(end)
+            means.append(average)
+        end = self.grid.join(ends)
+        at_end, average = (
+            torch.where(self.fed, self._read(x), self.found) for x in (end, self.grid.join(means))
+        )
+        taken = rate * average * (self.stencil.voxel_volume * self.dt)
+        return Moved(end, at_end, average, taken)
+
+    def _by_kernels(self, released: Tensor, mean: Tensor) -> Moved:
+        with no_derivatives():
+            plain = compiled_uptake.move(self, released, mean, self._far)
+        if not has_tangent(self.field, self.found, released, mean):
+            return Moved(*plain)
+        average, moved = plain[2], both(self.found)[1]
+        with no_derivatives():
+            end, at_end, there, taken = compiled_uptake.move_turned(
+                self, released, mean, average, self._far
+            )
+            still = torch.zeros_like(at_end) if moved is None else moved
+            at_end, there = (torch.where(self.fed, x, still) for x in (at_end, there))
+        turns = end, at_end, there, taken
+        return Moved(*(with_tangent(x, turn) for x, turn in zip(plain, turns, strict=True)))
+
+    def settled(self, moved: Moved, released: Tensor) -> tuple[Tensor, Tensor]:
+        """The signal at the end, (voxels,), to which cells have given exactly what they released,
+        up to rounding; and what they took beyond what there was, (B,), conc·µm³.
+
+        The iteration leaves a difference within its tolerance. It is written where the cell is; and
+        what is not there, is taken from all voxels of the colony in proportion to what they hold.
+        """
+        wanted = torch.where(self.fed, released.double().clamp(max=0.0), 0.0)
+        left, there = wanted + moved.taken, read(moved.end, self.stencil)
+        here = torch.maximum(left, -0.5 * there * self.pool)
+        end, missing = write(moved.end, here, self.stencil, there), here - left
+        none = missing.new_zeros(self.groups.size)
+        if not bool((missing > 0).any()):
+            return end, none
+        of_grids = Groups(self.grid.owner, self.groups.size, ordered=True)
+        content = of_grids.sum(end.unsqueeze(1)).squeeze(1) * self.grid.voxel_volume
+        missing = self.groups.sum(missing.unsqueeze(1)).squeeze(1)
+        kept = (1 - missing / content.clamp(min=TINY)).clamp(min=0.0)
+        kept = torch.where(missing > 0, kept, 1.0)
+        return end * kept.index_select(0, self.grid.owner), (missing - content).clamp(min=0.0)
+
+    def _spread(self, per_cell: Tensor) -> Tensor:
+        """(N,) to the voxels."""
+        return self.stencil.sum(self.stencil.weight.double() * per_cell.unsqueeze(1))
+
+    def _read(self, field: Tensor) -> Tensor:
+        """What each cell finds of a field (voxels,), (N,)."""
+        return (self.stencil.weight.double() * self.stencil.gather(field)).sum(1)

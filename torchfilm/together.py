@@ -1,0 +1,341 @@
+"""Circuits and transport of the signals that they exchange, solved together.
+
+Over a step a cell finds a concentration that goes evenly to what will be there at the end, with the
+mean that will have been there. Its circuit then says what it gives and takes, and with that given
+transport is linear (`signals.joint`). The equation says that the field is what the cells found, at
+the end and in the mean: it is of second order in the step, and where exchange or transport are
+fast, both follow. Anderson's mixing solves it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfilm.effects.bound_circuit import BoundCircuit
+from torchfilm.effects.bound_medium import BoundMedium
+from torchfilm.effects.circuit_kernels import PreparedStep
+from torchfilm.effects.circuit_report import Failures
+from torchfilm.medium_exchange import MediumExchange, Ramped
+from torchfilm.signals.joint import JointTransport, Moved
+from torchfilm.state import CELL, GRID, OUTSIDE, State
+from torchfilm.tools.fixed_point import DEPTH, FixedPoint, fixed_point, with_derivative
+from torchfilm.tools.tangents import both, no_derivatives, tracked
+from torchfilm.tools.threads import Shared
+from torchfilm.tools.timing import Timings
+
+# Iterations end where concentrations change by PART of the circuits' tolerance, or by FINE where
+# derivatives are wanted; they have failed if they do by LOST of it. MOST: iterations; a few are
+# usual.
+PART, FINE, LOST = 0.3, 1e-9, 10.0
+MOST = 50
+# Parts of a step into which a colony may divide it. ROUNDED: see `profile`.
+FINEST = 16
+ROUNDED = 1e-6
+GREEDY = (
+    "cells take more of a signal than there is. Let the rate at which they take it be 0 where the"
+    " signal is, as D1·s.ahl or a saturating k·s.ahl/(K + s.ahl) are"
+)
+UNSOLVED = (
+    "the solve of exchange with the medium and transport of signals did not converge, not in"
+    f" {FINEST} parts of the step either. Medium(exchange='turns') needs no solve"
+)
+_mixed = Shared()
+
+
+def joins(circuit: BoundCircuit, circuits: Sequence[BoundCircuit]) -> bool:
+    """Whether a circuit is solved with these: it exchanges signals, or reads what they do."""
+    given = {n for c in circuits for n in c.exchanges()}
+    return bool(given.intersection(circuit.signals)) and not circuit.why_turns
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What circuits and transport make of guesses: state, with the species of all circuits; what
+    cells released, (N,) by signal; the signals; and what failed in each circuit."""
+
+    state: State
+    released: dict[str, Tensor]
+    moved: dict[str, Moved]
+    reports: list[Failures]
+
+    def found(self) -> Tensor:
+        """Of each signal what each cell finds at the end, and in the mean, (N, E, 2)."""
+        each = [torch.stack([x.at_end, x.mean], 1) for x in self.moved.values()]
+        return torch.stack(each, 1)
+
+
+class Together:
+    """Circuits and transport of what they exchange, in one equation for each step of the medium."""
+
+    def __init__(self, circuits: Sequence[BoundCircuit], medium: BoundMedium):
+        self.circuits, self.medium = circuits, medium
+        self.place, self.title = medium.place, circuits[0].title
+        self.names = tuple(dict.fromkeys(n for c in circuits for n in c.exchanges()))
+        self.read = tuple(dict.fromkeys(n for c in circuits for n in c.signals))
+        self.rtol = min(c.effect.rtol for c in circuits)
+        self.finest = min(c.effect.atol / c.effect.rtol for c in circuits)
+
+    def run_step(self, state: State, dt: float, timings: Timings | None = None) -> State:
+        """The state after a step."""
+        number, medium, first = self.medium.effect.steps, self.medium, self.circuits[0]
+        with medium.transport.one_step():
+            for done in range(number):
+                with first.timed(state, timings), first.threads(state):
+                    state = self._part(state, dt / number, done, number)
+        with medium.timed(state, timings), medium.threads(state):
+            return medium.step(state, dt)
+
+    def _part(self, state: State, dt: float, done: int, number: int) -> State:
+        """The state after dt hours, one of a `number` of parts of a step, of which so many are
+        `done`. Colonies whose equation cannot be solved take two parts of half the length."""
+        medium = MediumExchange(state, self.read)
+        medium.find()
+        step, outcome, fixed = _solved(lambda: _Step(self, state, medium, dt, done, number))
+        made, again = self._finished(state, step, outcome, fixed)
+        if number >= FINEST * self.medium.effect.steps or not bool(again.any()):
+            return made
+        for k in (2 * done, 2 * done + 1):
+            state = self._part(state, dt / 2, k, 2 * number)
+        return self._chosen(made, state, again)
+
+    def _chosen(self, made: State, halved: State, again: Tensor) -> State:
+        """The one state, or in these colonies (B,) the other."""
+        assert made.layout is not None
+        owner = {CELL: made.colony, GRID: made.layout.grid.owner}
+        changed = {}
+        for name, x in made.fields.items():
+            other, scope = halved.fields[name], made.declared[name].scope
+            if other is not x:
+                there = again.index_select(0, owner[scope]) if scope in owner else again
+                changed[name] = torch.where(there, other, x)
+        reports = dict(made.reports)
+        for circuit in self.circuits:
+            own, of_halves = made.reports[circuit.title], halved.reports[circuit.title]
+            reports[circuit.title] = own.or_else(of_halves, again, made.colony)
+        return made.with_fields(**changed).replace(reports=reports)
+
+    def _finished(
+        self, state: State, step: _Step, outcome: Outcome, fixed: FixedPoint
+    ) -> tuple[State, Tensor]:
+        """The state of an outcome, and the colonies where it does not solve the equation, (B,)."""
+        changed = {}
+        overdrawn = torch.zeros_like(fixed.failed, dtype=torch.float64)
+        wanted = torch.zeros_like(overdrawn)
+        total = lambda amount: state.groups.sum(amount.unsqueeze(1)).squeeze(1)
+        for name, moved in outcome.moved.items():
+            old, released = state.fields[OUTSIDE + name], outcome.released[name].double()
+            end, beyond = step.transport[name].settled(moved, released)
+            changed[OUTSIDE + name] = end.to(old.dtype)
+            overdrawn = overdrawn + beyond.detach()
+            wanted = wanted + total(released.detach().clamp(max=0.0).neg())
+            if f"{name}_reservoir" in state.fields:
+                away = total(torch.where(step.fed, 0.0, released))
+                changed[f"{name}_reservoir"] = state.fields[f"{name}_reservoir"] + away
+        made, greedy = outcome.state.with_fields(**changed), overdrawn > LOST * self.rtol * wanted
+        for circuit, report in zip(self.circuits, outcome.reports, strict=True):
+            well = report.status == 0
+            report.note_colonies(greedy & well & ~fixed.failed, GREEDY)
+            report.note_colonies(fixed.failed & well, UNSOLVED)
+            noted = {"iterations": fixed.iterations, "overdrawn": overdrawn}
+            made = circuit.reported(made, report, None, step.done, noted)
+        return made, fixed.failed | greedy
+
+
+class _Step:
+    """The function from guesses (N, E, 2), of what each cell finds of each signal at the end and in
+    the mean, to the outcome. found: (N,) by signal, at the start, and `first` in float64."""
+
+    def __init__(
+        self, together: Together, state: State, medium: MediumExchange, dt: float, done: int,
+        number: int,
+    ):  # fmt: skip
+        self.together, self.state, self.dt = together, state, dt
+        self.done, self.number = done, number
+        self.found = medium.found
+        self.first = {n: self.found[n].double() for n in together.names}
+        outside, layout = medium.in_reservoir, state.layout
+        assert layout is not None
+        self.fed = torch.ones_like(state.colony, dtype=torch.bool) if outside is None else ~outside
+        transport = together.medium.transport
+        self.transport = {
+            n: JointTransport(
+                layout.grid, transport.with_uptake(n, state), medium.stencil,
+                medium.pool.double(), state.groups, state.fields[OUTSIDE + n], self.first[n],
+                self.fed, together.finest, dt,
+            )
+            for n in together.names
+        }  # fmt: skip
+
+    def start(self) -> Tensor:
+        """The first guess: nothing changes."""
+        first = torch.stack([self.first[n] for n in self.together.names], 1)
+        return both(first)[0].unsqueeze(2).expand(-1, -1, 2)
+
+    def ramped(self, x: Tensor) -> Ramped:
+        """What circuits find by these guesses."""
+        # networks know all signals of the medium, also those that none of them exchanges
+        half, none = dict(self.found), torch.zeros(1, device=x.device, dtype=self.state.dtype)
+        ramp = {n: (s, none.expand(len(x))) for n, s in half.items()}
+        for k, name in enumerate(self.together.names):
+            begin, half[name], rate = profile(x[:, k], self.dt, self.state.dtype)
+            ramp[name] = begin, rate
+        return Ramped(half, ramp)
+
+    def __call__(self, x: Tensor) -> Outcome:
+        state, names = self.state, self.together.names
+        released = {n: torch.zeros_like(self.first[n]) for n in names}
+        reports = []
+        for circuit in self.together.circuits:
+            reports.append(self.report(circuit))
+            if state.cells:
+                around = self.ramped(x)
+                changed = circuit.changed(
+                    state, self.dt, self.done, self.number, around, reports[-1]
+                )
+                state = state.with_fields(**changed)
+                given = around.released
+                released |= {n: released[n] + y for n, y in given.items() if n in released}
+        moved = {n: self.transport[n].moved(released[n], x[:, k, 1]) for k, n in enumerate(names)}
+        return Outcome(state, released, moved, reports)
+
+    def report(self, circuit: BoundCircuit) -> Failures:
+        return Failures(self.state, circuit.effect.method, self.dt)
+
+    def turned(self) -> Tensor:
+        """Colonies whose equation has changed since this was asked, (B,) bool."""
+        found = torch.zeros(self.state.colonies, dtype=torch.bool, device=self.state.device)
+        for one in self.transport.values():
+            found |= one.turned
+            one.turned.zero_()
+        return found
+
+    @property
+    def close(self) -> float:
+        """Where the iteration ends."""
+        return PART * self.together.rtol
+
+
+def profile(x: Tensor, dt: float, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    """What cells find over a step of dt hours, that ends where x (N, 2) says and has its mean: the
+    begin of a line, its middle, and its slope, (N,) each. Where the mean is below half the end, the
+    line begins at 0. By its rounding it does not go below 0."""
+    end, mean = x.unbind(1)
+    begin = (2 * mean - end).clamp(min=0.0).to(dtype)
+    least = -begin.double() * (1 - ROUNDED)
+    change = torch.maximum(end - begin, least)
+    return begin, (begin + 0.5 * change).to(dtype), (change / dt).to(dtype)
+
+
+def _solved(make: Callable[[], _Step]) -> tuple[_Step, Outcome, FixedPoint]:
+    """The step that `make` gives, its outcome, with derivatives where they are wanted, and the
+    solution."""
+    step = make()
+    if (found := _by_kernels(step, step.close)) is not None:
+        return step, *found
+    outcome = step(step.start())
+    if not tracked(outcome.found()):
+        return step, *_by_torch(step, step.close, outcome)
+    with no_derivatives():
+        bare = make()
+        _, fixed = _by_kernels(bare, FINE) or _by_torch(bare, FINE)
+    x = with_derivative(
+        lambda x: step(x).found(), fixed.x, step.state.groups, FINE, MOST, "exchange of signals"
+    )
+    return step, step(x), fixed
+
+
+def _by_torch(
+    step: _Step, close: float, known: Outcome | None = None
+) -> tuple[Outcome, FixedPoint]:
+    """The outcome and the solution. known: the outcome of the first guess."""
+    start, groups, finest = step.start(), step.state.groups, step.together.finest
+    last = [known or step(start)]
+
+    def found(x: Tensor) -> Tensor:
+        if x is not start:  # that is known
+            last[0] = step(x)
+        return last[0].found()
+
+    fixed = fixed_point(
+        found, start, lambda x: x + finest, groups, close, MOST, positive=True,
+        lost=LOST * step.together.rtol, turned=step.turned,
+    )  # fmt: skip
+    return last[0], fixed
+
+
+def _by_kernels(step: _Step, close: float) -> tuple[Outcome, FixedPoint] | None:
+    """The same by kernels, one circuit again and again with what changes written in place; None
+    where torch is to do it."""
+    together, state, names = step.together, step.state, step.together.names
+    circuit = together.circuits[0]
+    alone = len(together.circuits) == 1 and state.cells
+    if not alone or not all(x.by_kernels for x in step.transport.values()):
+        return None
+    start, report = step.start(), step.report(circuit)
+    around = step.ramped(start)
+    made = circuit.prepared(state, step.dt, step.done, step.number, around, report)
+    if made is None:
+        return None
+    iteration = _Iteration(step, start.numpy(), close)
+    while True:
+        made.run(circuit.kernels.again)
+        moved = iteration.moved(made)
+        if not iteration.goes_on():
+            break
+        for k, name in enumerate(names):
+            columns = around.ramp[name][0], around.found[name], around.ramp[name][1]
+            for column, new in zip(
+                columns, profile(iteration.x[:, k], step.dt, state.dtype), strict=True
+            ):
+                column.copy_(new)  # of which kernels know the address
+    changed = made.finished() | {circuit.effect.volume_field: made.start.half.end}
+    released = {n: around.released.get(n, torch.zeros_like(step.first[n])) for n in names}
+    fixed = FixedPoint(iteration.x, iteration.iterations, iteration.far)
+    return Outcome(state.with_fields(**changed), released, moved, [report]), fixed
+
+
+class _Iteration:
+    """The iteration of `_by_kernels`. x: (N, E, 2), the guesses. iterations, going, far: (B,)."""
+
+    def __init__(self, step: _Step, start: np.ndarray, close: float):
+        self.limits = close, LOST * step.together.rtol
+        self.step, self.count, colonies = step, 0, step.state.colonies
+        self.x = torch.from_numpy(np.ascontiguousarray(start))
+        self.new = torch.empty_like(self.x)
+        numbers = self.x.numel()
+        control = np.tile([0.0, np.inf, 1.0], (colonies, 1))
+        self._earlier = np.zeros((4, numbers)), np.empty((DEPTH, 2, numbers)), control
+        self._scale = np.full(numbers, step.together.finest), np.ones(numbers, bool)
+        self.iterations = torch.zeros(colonies, dtype=torch.int64)
+        self.going = torch.ones(colonies, dtype=torch.bool)
+        self.far = torch.zeros(colonies, dtype=torch.bool)
+
+    def moved(self, made: PreparedStep) -> dict[str, Moved]:
+        """The signals, for what cells have just released."""
+        out, given = {}, dict(zip(made.names, made.released, strict=True))
+        for k, (name, transport) in enumerate(self.step.transport.items()):
+            released = given.get(name)
+            amount = transport.found.new_zeros(len(self.x)) if released is None else None
+            amount = torch.from_numpy(released) if amount is None else amount
+            out[name] = transport.moved(amount, self.x[:, k, 1])
+            self.new[:, k, 0], self.new[:, k, 1] = out[name].at_end, out[name].mean
+        return out
+
+    def goes_on(self) -> bool:
+        """Make the next guess; whether it is to be tried."""
+        from torchfilm.kernels.joint import mix
+
+        given = (
+            self.step.state.groups.ends, self.x[0].numel(), self.x.numpy().reshape(-1),
+            self.new.numpy().reshape(-1), *self._earlier, *self._scale, self.limits,
+            self.step.turned().numpy(), self.iterations.numpy(), self.going.numpy(),
+            self.far.numpy(),
+        )  # fmt: skip
+        _mixed(len(self.going), lambda begin, end: mix(begin, end, *given))
+        self.count += 1
+        return bool(self.going.any()) and self.count < MOST
