@@ -116,6 +116,8 @@ class FirstHalf(_MediumPart):
         return [f"over {hours}, by the methods that the main part of transport lists"]
 
     def summary(self) -> str:
+        if self.transport.coupled.keys() >= {*self.effect.signals}:
+            return "rests: all signals are moved together with what cells do to them"
         return "moves signals before cells exchange them: Strang's first half"
 
 

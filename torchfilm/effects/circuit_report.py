@@ -98,7 +98,7 @@ def _of_swing(swing: Tensor, ids: Tensor, where: Tensor) -> str:
         f" medium at the cells by {worst:.0%} in the mean, which transport and the other cells see"
         " only afterwards; concentrations there may be off by as much. With"
         f" {worst / FINE:.0f} times as many Medium(steps=…), or a dt smaller by as much, it is a"
-        " tenth."
+        " tenth. Circuits that do not count molecules need no turns: Medium(exchange='together')."
     )
 
 

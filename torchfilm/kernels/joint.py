@@ -177,6 +177,25 @@ def put_turned_shares(dmore, dloss, drates, given, guess, dgiven, dguess, fed, n
             dloss[node[i, k] - start] += weight[i, k] * drates[i]
 
 
+@kernel
+def turned_euler(u, du, more, dmore, dloss, dt, pad, grid, times, within, operator, room, most):
+    """The tangents of a step of backward Euler of one grid, to `final` and `mean` of the room.
+    Whether both solves converged. within: of a residual. most: iterations."""
+    x, r, b, final, mean, spare, symmetric = (
+        room[2], room[3], room[4], room[5], room[6], room[7], operator[8],
+    )  # fmt: skip
+    for i in range(u.size):
+        x[pad + i], b[i] = u[i], u[i] + dt * more[i]
+    good = backward_euler(x, b, r, pad, grid, times, within, symmetric, most, spare)
+    for i in range(u.size):
+        b[i] = du[i] + dt * (dmore[i] - dloss[i] * x[pad + i])
+        x[pad + i] = du[i]
+    good &= backward_euler(x, b, r, pad, grid, times, within, symmetric, most, spare)
+    for i in range(u.size):
+        final[i] = mean[i] = x[pad + i]
+    return good
+
+
 @kernel(entry=True)
 def move_turned(
     begin, end, starts, colonies, ends, strides, stay, ups, downs, wrap_to, wrap_from, wraps, rate,
@@ -193,14 +212,12 @@ def move_turned(
     wide, terms = size + 2 * pad, int(settings[2] + 10 * np.sqrt(settings[2]) + 31)
     fields, wider = np.empty((11, size)), np.zeros((7, wide))
     loss, more, dloss, dmore = fields[0], fields[6], fields[7], fields[8]
-    b, r = fields[3], fields[2]
-    x, u, du = wider[0], fields[9], fields[10]
+    u, du = fields[9], fields[10]
     room = (
-        loss, fields[1], x, r, b, fields[4], fields[5], wider[2:], wider[1], np.empty(terms),
-        np.empty(terms),
+        loss, fields[1], wider[0], fields[2], fields[3], fields[4], fields[5], wider[2:], wider[1],
+        np.empty(terms), np.empty(terms),
     )  # fmt: skip
     final, mean, weights, tails = fields[4], fields[5], room[9], room[10]
-    _, cut, _, tolerance, rounding, most = settings
     per_voxel, rates, drates = 1 / (voxel_volume * dt), np.empty(given.size), taken
     for c in range(begin, end):
         own = c if stay.shape[0] > 1 else 0
@@ -224,18 +241,12 @@ def move_turned(
         fastest, at, grid = with_losses(dt, operator, room, settings)
         times, good = at * dt, True
         if far[c]:
-            within = max(tolerance, rounding * dt * fastest)
-            for i in range(size):
-                x[pad + i], b[i] = u[i], u[i] + dt * more[i]
-            good = backward_euler(x, b, r, pad, grid, times, within, symmetric, most, room[7])
-            for i in range(size):
-                b[i] = du[i] + dt * (dmore[i] - dloss[i] * x[pad + i])
-                x[pad + i] = du[i]
-            good &= backward_euler(x, b, r, pad, grid, times, within, symmetric, most, room[7])
-            for i in range(size):
-                final[i] = mean[i] = x[pad + i]
+            within = max(settings[3], settings[4] * dt * fastest)
+            turned = more, dmore, dloss
+            good = turned_euler(u, du, *turned, dt, pad, grid, times, within, operator, room,
+                                settings[5])  # fmt: skip
         else:
-            used = poisson(times, cut, weights, tails)
+            used = poisson(times, settings[1], weights, tails)
             turned_series(u, du, pad, grid, weights, tails, used, more / at, dmore / at, dloss, at,
                           final, mean, room[7])  # fmt: skip
             for i in range(size):
