@@ -23,6 +23,7 @@ from torchfilm.effects.circuit_report import Failures
 from torchfilm.medium_exchange import MediumExchange, Ramped
 from torchfilm.signals.joint import JointTransport, Moved
 from torchfilm.state import CELL, GRID, OUTSIDE, State
+from torchfilm.tools import checks
 from torchfilm.tools.fixed_point import DEPTH, FixedPoint, fixed_point, with_derivative
 from torchfilm.tools.tangents import both, no_derivatives, tracked
 from torchfilm.tools.threads import Shared
@@ -39,10 +40,6 @@ ROUNDED = 1e-6
 GREEDY = (
     "cells take more of a signal than there is. Let the rate at which they take it be 0 where the"
     " signal is, as D1·s.ahl or a saturating k·s.ahl/(K + s.ahl) are"
-)
-UNSOLVED = (
-    "the solve of exchange with the medium and transport of signals did not converge, not in"
-    f" {FINEST} parts of the step either. Medium(exchange='turns') needs no solve"
 )
 _mixed = Shared()
 
@@ -63,6 +60,12 @@ class Outcome:
     moved: dict[str, Moved]
     reports: list[Failures]
 
+    def tracked(self, before: State) -> bool:
+        """Whether derivatives by any of it are wanted."""
+        fields = self.state.fields
+        changed = [x for n, x in fields.items() if x is not before.fields.get(n)]
+        return tracked(self.found(), *self.released.values(), *changed)
+
     def found(self) -> Tensor:
         """Of each signal what each cell finds at the end, and in the mean, (N, E, 2)."""
         each = [torch.stack([x.at_end, x.mean], 1) for x in self.moved.values()]
@@ -82,6 +85,7 @@ class Together:
 
     def run_step(self, state: State, dt: float, timings: Timings | None = None) -> State:
         """The state after a step."""
+        checks.number("dt", dt, above=0.0)
         number, medium, first = self.medium.effect.steps, self.medium, self.circuits[0]
         with medium.transport.one_step():
             for done in range(number):
@@ -92,16 +96,27 @@ class Together:
 
     def _part(self, state: State, dt: float, done: int, number: int) -> State:
         """The state after dt hours, one of a `number` of parts of a step, of which so many are
-        `done`. Colonies whose equation cannot be solved take two parts of half the length."""
+        `done`. Colonies whose equation cannot be solved take two parts of half the length, and
+        in the shortest ones turns."""
         medium = MediumExchange(state, self.read)
         medium.find()
         step, outcome, fixed = _solved(lambda: _Step(self, state, medium, dt, done, number))
-        made, again = self._finished(state, step, outcome, fixed)
-        if number >= FINEST * self.medium.effect.steps or not bool(again.any()):
+        made, again, greedy = self._finished(state, step, outcome, fixed)
+        if not bool(again.any()):
             return made
+        if number >= FINEST * self.medium.effect.steps:
+            again = again & ~greedy
+            taken = self._in_turns(state, dt, done, number) if bool(again.any()) else made
+            return self._chosen(made, taken, again)
         for k in (2 * done, 2 * done + 1):
             state = self._part(state, dt / 2, k, 2 * number)
         return self._chosen(made, state, again)
+
+    def _in_turns(self, state: State, dt: float, done: int, number: int) -> State:
+        """The same part in turns: circuits with pools, and then transport."""
+        for circuit in self.circuits:
+            state = circuit.turn(state, dt, done, number)
+        return self.medium.transport.carried(state, dt, dt, names=frozenset(self.names))
 
     def _chosen(self, made: State, halved: State, again: Tensor) -> State:
         """The one state, or in these colonies (B,) the other."""
@@ -121,8 +136,9 @@ class Together:
 
     def _finished(
         self, state: State, step: _Step, outcome: Outcome, fixed: FixedPoint
-    ) -> tuple[State, Tensor]:
-        """The state of an outcome, and the colonies where it does not solve the equation, (B,)."""
+    ) -> tuple[State, Tensor, Tensor]:
+        """The state of an outcome; the colonies where it does not solve the equation, (B,); and
+        those where it does, but cells take what is not there."""
         changed = {}
         overdrawn = torch.zeros_like(fixed.failed, dtype=torch.float64)
         wanted = torch.zeros_like(overdrawn)
@@ -136,14 +152,14 @@ class Together:
             if f"{name}_reservoir" in state.fields:
                 away = total(torch.where(step.fed, 0.0, released))
                 changed[f"{name}_reservoir"] = state.fields[f"{name}_reservoir"] + away
-        made, greedy = outcome.state.with_fields(**changed), overdrawn > LOST * self.rtol * wanted
+        made = outcome.state.with_fields(**changed)
+        greedy = (overdrawn > LOST * self.rtol * wanted) & ~fixed.failed
         for circuit, report in zip(self.circuits, outcome.reports, strict=True):
             well = report.status == 0
-            report.note_colonies(greedy & well & ~fixed.failed, GREEDY)
-            report.note_colonies(fixed.failed & well, UNSOLVED)
+            report.note_colonies(greedy & well, GREEDY)
             noted = {"iterations": fixed.iterations, "overdrawn": overdrawn}
             made = circuit.reported(made, report, None, step.done, noted)
-        return made, fixed.failed | greedy
+        return made, fixed.failed | greedy, greedy
 
 
 class _Step:
@@ -174,7 +190,7 @@ class _Step:
     def start(self) -> Tensor:
         """The first guess: nothing changes."""
         first = torch.stack([self.first[n] for n in self.together.names], 1)
-        return both(first)[0].unsqueeze(2).expand(-1, -1, 2)
+        return both(first)[0].unsqueeze(2).repeat(1, 1, 2)
 
     def ramped(self, x: Tensor) -> Ramped:
         """What circuits find by these guesses."""
@@ -227,7 +243,8 @@ def profile(x: Tensor, dt: float, dtype: torch.dtype) -> tuple[Tensor, Tensor, T
     end, mean = x.unbind(1)
     begin = (2 * mean - end).clamp(min=0.0).to(dtype)
     least = -begin.double() * (1 - ROUNDED)
-    change = torch.maximum(end - begin, least)
+    change = end - begin
+    change = torch.where(change < least, least, change)
     return begin, (begin + 0.5 * change).to(dtype), (change / dt).to(dtype)
 
 
@@ -238,7 +255,7 @@ def _solved(make: Callable[[], _Step]) -> tuple[_Step, Outcome, FixedPoint]:
     if (found := _by_kernels(step, step.close)) is not None:
         return step, *found
     outcome = step(step.start())
-    if not tracked(outcome.found()):
+    if not outcome.tracked(step.state):
         return step, *_by_torch(step, step.close, outcome)
     with no_derivatives():
         bare = make()
@@ -254,6 +271,12 @@ def _by_torch(
 ) -> tuple[Outcome, FixedPoint]:
     """The outcome and the solution. known: the outcome of the first guess."""
     start, groups, finest = step.start(), step.state.groups, step.together.finest
+    if step.state.cells and all(x.operators for x in step.transport.values()):
+        # as `_by_kernels` mixes: a colony's bits must not depend on the circuits of others
+        iteration, outcome = _Iteration(step, start.numpy(), close), known or step(start)
+        while iteration.goes_on(outcome.found()):
+            outcome = step(iteration.x)
+        return outcome, iteration.fixed()
     last = [known or step(start)]
 
     def found(x: Tensor) -> Tensor:
@@ -262,7 +285,8 @@ def _by_torch(
         return last[0].found()
 
     fixed = fixed_point(
-        found, start, lambda x: x + finest, groups, close, MOST, positive=True,
+        found, start, lambda x, new: torch.maximum(x, new) + finest, groups, close, MOST,
+        positive=True,
         lost=LOST * step.together.rtol, turned=step.turned,
     )  # fmt: skip
     return last[0], fixed
@@ -295,8 +319,7 @@ def _by_kernels(step: _Step, close: float) -> tuple[Outcome, FixedPoint] | None:
                 column.copy_(new)  # of which kernels know the address
     changed = made.finished() | {circuit.effect.volume_field: made.start.half.end}
     released = {n: around.released.get(n, torch.zeros_like(step.first[n])) for n in names}
-    fixed = FixedPoint(iteration.x, iteration.iterations, iteration.far)
-    return Outcome(state.with_fields(**changed), released, moved, [report]), fixed
+    return Outcome(state.with_fields(**changed), released, moved, [report]), iteration.fixed()
 
 
 class _Iteration:
@@ -326,10 +349,17 @@ class _Iteration:
             self.new[:, k, 0], self.new[:, k, 1] = out[name].at_end, out[name].mean
         return out
 
-    def goes_on(self) -> bool:
-        """Make the next guess; whether it is to be tried."""
+    def fixed(self) -> FixedPoint:
+        """What it has come to."""
+        return FixedPoint(self.x, self.iterations, self.far)
+
+    def goes_on(self, found: Tensor | None = None) -> bool:
+        """Make the next guess; whether it is to be tried. found: what came of the last, if it is
+        not in `new`."""
         from torchfilm.kernels.joint import mix
 
+        if found is not None:
+            self.new.copy_(found)
         given = (
             self.step.state.groups.ends, self.x[0].numel(), self.x.numpy().reshape(-1),
             self.new.numpy().reshape(-1), *self._earlier, *self._scale, self.limits,

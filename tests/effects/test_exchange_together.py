@@ -22,9 +22,9 @@ SIX = tf.Cells(
 TIGHT = {"rtol": 1e-8, "atol": 1e-10}
 
 
-def medium(diffusion=30.0, decay=0.5, **options) -> tf.Medium:
+def medium(diffusion=30.0, decay=0.5, initial=0.0, **options) -> tf.Medium:
     given = {"box": BOX, "spacing": 4.0, "exchange": "together", **options}
-    return tf.Medium(ahl=tf.Signal(diffusion, decay=decay), **given)
+    return tf.Medium(ahl=tf.Signal(diffusion, decay=decay, initial=initial), **given)
 
 
 def lux(u, s, p, cell):
@@ -248,13 +248,15 @@ def test_a_nutrient_that_circuits_exchange_takes_turns():
 
 @pytest.mark.parametrize("diffusion", [30.0, 1e5])
 @pytest.mark.parametrize("backend", [None, "torch"])
-def test_derivatives(diffusion, backend):
-    """Backward pass and forward mode against differences, by constants of cells and of
-    transport."""
+@pytest.mark.parametrize("moves", [True, False])
+def test_derivatives(diffusion, backend, moves):
+    """Backward pass and forward mode against differences, by constants of cells and of transport,
+    or of cells alone: then kernels carry the tangents."""
 
     def outcome(x):
         circuit = {"rtol": 0.05, "atol": 0.05, "backend": backend}
-        made = talking(D1=10.0 * x, gain=20.0 * x, circuit=circuit, diffusion=diffusion * x)
+        speed = diffusion * x if moves else diffusion
+        made = talking(D1=10.0 * x, gain=20.0 * x, circuit=circuit, diffusion=speed, initial=0.01)
         state = made.bind(dtype=F64).start()
         for _ in range(3):
             state = step(made, state, 0.01)
@@ -273,3 +275,67 @@ def test_derivatives(diffusion, backend):
     slope = float(ahead.detach() - back.detach()) / 2e-4
     assert float(at.grad) == pytest.approx(slope, rel=1e-5)
     assert float(forward) == pytest.approx(slope, rel=1e-5)
+
+
+def igniting(u, s, p, cell):
+    into = p.D1 * (s.ahl - u.ahl) * cell.area
+    made = p.base + 100.0 * u.ahl**2 / (1e-4 + u.ahl**2)
+    return {"ahl": made + into / cell.volume}, {"ahl": -into}
+
+
+@pytest.mark.parametrize("diffusion", [0.0, 30.0, 3000.0])
+def test_cells_that_ignite_within_a_step(diffusion):
+    """They switch on a thousandfold, and share what they make through their voxels."""
+    circuit = tf.Circuit(igniting, species="ahl", D1=1e3, base=0.1)
+    made = resting(medium(diffusion), circuit, SIX)
+    end = advance(made, made.bind(dtype=F64).start(), 20, DT)
+    short = advance(made, made.bind(dtype=F64).start(), 160, DT / 8)
+    torch.testing.assert_close(end.ahl, short.ahl, rtol=0.05, atol=0.0)
+
+
+def test_a_gradient_passes_to_a_circuit_that_only_reads():
+    def seen(k):
+        read = lambda u, s, p, cell: {"seen": p.k * s.ahl - u.seen}
+        made = tf.Scene(
+            tf.Circuit(lux, species="ahl", D1=10.0, gain=20.0, name="A"),
+            tf.Circuit(read, species="seen", name="B", k=k),
+            medium(), founders=SIX,
+        )  # fmt: skip
+        return advance(made, made.bind(dtype=F64).start(), 3, DT).B_seen.sum()
+
+    k = torch.tensor(1.0, dtype=F64, requires_grad=True)
+    seen(k).backward()
+    # without a gradient the equation is solved to the circuits' tolerance
+    assert float(k.grad) == pytest.approx(float(seen(torch.tensor(1.0))), rel=1e-4)
+
+
+@pytest.mark.parametrize("backend", [None, "torch"])
+def test_derivatives_by_an_exchange_that_is_0(backend):
+    """Nothing is given or taken."""
+
+    def field(D1):
+        circuit = tf.Circuit(
+            lux, species="ahl", initial={"ahl": 2.0}, D1=D1, gain=0.0, backend=backend, **TIGHT
+        )
+        made = resting(medium(initial=1.0), circuit, SIX)
+        return advance(made, made.bind(dtype=F64).start(), 1, DT).signals["ahl"].sum()
+
+    at = torch.tensor(0.0, dtype=F64, requires_grad=True)
+    field(at).backward()
+    zero, one = torch.zeros((), dtype=F64), torch.ones((), dtype=F64)
+    with forward_mode():
+        forward = tangent(field(with_tangent(zero, one)))
+    slope = float(field(torch.tensor(1e-6, dtype=F64)) - field(zero)) / 1e-6
+    assert float(at.grad) == pytest.approx(slope, rel=1e-4)
+    assert float(forward) == pytest.approx(slope, rel=1e-4)
+
+
+@pytest.mark.parametrize("given", [{"method": "implicit"}, {"splitting": "lie"}])
+def test_a_method_of_turns_means_turns(given):
+    plain = resting(
+        tf.Medium(ahl=tf.Signal(30.0), box=BOX, spacing=4.0, **given), exchanging(), SIX
+    )
+    report = advance(plain, plain.bind().start(), 1, DT).reports["circuit"]
+    assert report.exchanged is not None and not isinstance(report.iterations, torch.Tensor)
+    with pytest.raises(tf.InputError, match="method and splitting are of turns"):
+        resting(medium(**given), exchanging(), SIX).bind()

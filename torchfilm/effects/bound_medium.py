@@ -162,6 +162,8 @@ class BoundMedium(_MediumPart):
         why = next((why for e in circuits if e.exchanges() and (why := e.why_turns)), "")
         if both := [n for n in given if n in eaten]:
             why = f"Nutrition moves {both[0]}, and a circuit exchanges it, too."
+        if self.effect.carries_in_turns:
+            why = why or "Its method and splitting are of turns: leave them out."
         if why and self.effect.exchange == "together":
             raise checks.input_error("Medium.exchange", "together", '"turns"', why)
         joint = bool(given) and not why and self.effect.exchange != "turns"

@@ -51,7 +51,12 @@ class CircuitReport:
             status=torch.maximum(earlier.status, self.status),
             steps=earlier.steps + self.steps,
             words={**self.words, **earlier.words},
-            exchanged=self.exchanged and self.exchanged.after(earlier.exchanged),
+            # a part may have taken turns after others that were solved
+            exchanged=(
+                self.exchanged.after(earlier.exchanged)
+                if self.exchanged and earlier.exchanged
+                else None
+            ),
             iterations=earlier.iterations + self.iterations,
             overdrawn=earlier.overdrawn + self.overdrawn,
         )
@@ -59,7 +64,6 @@ class CircuitReport:
     def or_else(self, other: CircuitReport, where: Tensor, colony: Tensor) -> CircuitReport:
         """This report, or in the colonies `where` (B,) another one. colony: of each cell, (N,)."""
         places = set(torch.nonzero(where).squeeze(1).tolist())
-        assert isinstance(self.iterations, Tensor) and isinstance(self.overdrawn, Tensor)
         return replace(
             self,
             status=torch.where(where, other.status, self.status),

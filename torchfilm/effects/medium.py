@@ -105,7 +105,8 @@ class Medium(Effect):
     exchange: how circuits and the medium exchange signals. "together": circuits and transport of
     these signals are one equation over the step, of second order, whatever crosses a membrane or a
     voxel in seconds. "turns": circuits with a pool for each cell, then transport; of first order,
-    and two to three times as fast. Default: together, but in turns where circuits count molecules.
+    and two to three times as fast. Default: together, but in turns where circuits count molecules,
+    a nutrient is exchanged as well, or a `method` or `splitting` is given.
     steps: into which exchange and transport divide a step of the scene; growth and contacts do not.
 
     method: of transport in turns, and of signals that no cell exchanges: "exponential" (exact if
@@ -226,6 +227,11 @@ class Medium(Effect):
             return low, high, (x, y, self.spacing[2])
         depth = x if self.depth is None else self.depth
         return (*low, self.height - depth / 2), (*high, self.height + depth / 2), (x, y, depth)
+
+    @property
+    def carries_in_turns(self) -> bool:
+        """Whether it is given what only transport in turns has: a method, or a splitting."""
+        return self.method is not None or self.splitting != "strang"
 
     @property
     def halves(self) -> bool:

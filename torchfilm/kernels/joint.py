@@ -166,14 +166,16 @@ def put_turned_shares(dmore, dloss, drates, given, guess, dgiven, dguess, fed, n
         if not fed[i]:
             continue
         share, turn = given[i] * per_voxel, dgiven[i] * per_voxel
-        if share >= 0:
-            for k in range(node.shape[1]):
-                dmore[node[i, k] - start] += weight[i, k] * turn
-            continue
         there = max(guess[i], TINY)
-        if -share / there < most:
+        # as `joint._parted` divides what is neither given nor taken
+        gift = turn if share > 0 or (share == 0 and guess[i] <= 0) else 0.0
+        if share == 0 and guess[i] > 0:
+            gift = 0.5 * turn
+            drates[i] = -0.5 * turn / there
+        elif share < 0 and -share / there < most:
             drates[i] = (share / there * dguess[i] - turn) / there
         for k in range(node.shape[1]):
+            dmore[node[i, k] - start] += weight[i, k] * gift
             dloss[node[i, k] - start] += weight[i, k] * drates[i]
 
 

@@ -176,7 +176,7 @@ def next_guess(mean, new, memory, changes, matrix, right, half, fed, close, lost
     done, near, size = True, True, 0.0
     for i in range(mean.size):
         new[i] = new[i] if fed[i] else mean[i]
-        off = abs(new[i] - mean[i]) / (half[i] + mean[i])
+        off = abs(new[i] - mean[i]) / (half[i] + max(mean[i], new[i]))
         near = near and off <= lost
         done = done and not off > close  # a NaN stays one
         size += off * off
@@ -202,12 +202,12 @@ def next_guess(mean, new, memory, changes, matrix, right, half, fed, close, lost
         for b in range(a, count):
             total = 0.0
             for i in range(mean.size):
-                weight = 1 / (half[i] + mean[i])
+                weight = 1 / (half[i] + max(mean[i], new[i]))
                 total += changes[a, 1, i] * weight * (changes[b, 1, i] * weight)
             matrix[a, b] = matrix[b, a] = total
         right[a] = 0.0
         for i in range(mean.size):
-            weight = 1 / (half[i] + mean[i])
+            weight = 1 / (half[i] + max(mean[i], new[i]))
             right[a] += changes[a, 1, i] * weight * ((new[i] - mean[i]) * weight)
     solve_mixed(matrix, right, count)
     for i in range(mean.size):

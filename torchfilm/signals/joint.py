@@ -41,6 +41,15 @@ class Moved(NamedTuple):
     taken: Tensor
 
 
+def _parted(released: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
+    """What is given and what is taken, (N,) each. At 0 their derivatives add up to that of what is
+    released: half each, but where there is nothing to take all of it is given."""
+    half = torch.where(mean > 0, 0.5, 0.0) * released
+    none = released == 0
+    given = torch.where(none, released - half, released.clamp(min=0.0))
+    return given, torch.where(none, -half, (-released).clamp(min=0.0))
+
+
 @dataclass(frozen=True, eq=False)
 class JointTransport:
     """Transport of a signal over `dt` hours about cells in given places.
@@ -93,8 +102,9 @@ class JointTransport:
         if self.operators and (may_run(*numbers) or only_forward(*numbers)):
             return self._by_kernels(released, mean)
         per_volume = torch.where(self.fed, released / (self.stencil.voxel_volume * self.dt), 0.0)
-        given = self._spread(per_volume.clamp(min=0.0))
-        rate = (-per_volume).clamp(min=0.0) / mean.clamp(min=TINY)
+        gift, wanted = _parted(per_volume, mean)
+        given = self._spread(gift)
+        rate = wanted / mean.clamp(min=TINY)
         rate = rate.clamp(max=EMPTY / self.dt)
         losses = self._spread(rate)
         ends, means = [], []
@@ -120,12 +130,11 @@ class JointTransport:
         if not has_tangent(self.field, self.found, released, mean):
             return Moved(*plain)
         average, moved = plain[2], both(self.found)[1]
-        with no_derivatives():
-            end, at_end, there, taken = compiled_uptake.move_turned(
-                self, released, mean, average, self._far
-            )
-            still = torch.zeros_like(at_end) if moved is None else moved
-            at_end, there = (torch.where(self.fed, x, still) for x in (at_end, there))
+        end, at_end, there, taken = compiled_uptake.move_turned(
+            self, released, mean, average, self._far
+        )
+        still = torch.zeros_like(at_end) if moved is None else moved
+        at_end, there = (torch.where(self.fed, x, still) for x in (at_end, there))
         turns = end, at_end, there, taken
         return Moved(*(with_tangent(x, turn) for x, turn in zip(plain, turns, strict=True)))
 
@@ -136,7 +145,7 @@ class JointTransport:
         The iteration leaves a difference within its tolerance. It is written where the cell is; and
         what is not there, is taken from all voxels of the colony in proportion to what they hold.
         """
-        wanted = torch.where(self.fed, released.double().clamp(max=0.0), 0.0)
+        wanted = -_parted(torch.where(self.fed, released.double(), 0.0), moved.mean)[1]
         left, there = wanted + moved.taken, read(moved.end, self.stencil)
         here = torch.maximum(left, -0.5 * there * self.pool)
         end, missing = write(moved.end, here, self.stencil, there), here - left

@@ -98,8 +98,8 @@ def solve(
     half = both(eaters.half)[0].detach()
     with torch.no_grad():
         fixed = fixed_point(
-            lambda x: both(step(x)[1])[0], both(found)[0], lambda x: half + x, eaters.groups,
-            CLOSE, MOST, positive=True,
+            lambda x: both(step(x)[1])[0], both(found)[0],
+            lambda x, new: half + torch.maximum(x, new), eaters.groups, CLOSE, MOST, positive=True,
         )  # fmt: skip
     mean = fixed.x
     if tracked(field, found, *numbers, *(x for one in carried for x in one.numbers())):

@@ -35,7 +35,7 @@ class FixedPoint(NamedTuple):
 def fixed_point(
     function: Callable[[Tensor], Tensor],
     start: Tensor,
-    scale: Callable[[Tensor], Tensor],
+    scale: Callable[[Tensor, Tensor], Tensor],
     groups: Groups,
     close: float,
     most: int,
@@ -43,18 +43,18 @@ def fixed_point(
     lost: float | None = None,
     turned: Callable[[], Tensor] | None = None,
 ) -> FixedPoint:
-    """x = function(x), from start (N, …) float64, up to |function(x) − x| ≤ close · scale(x) for
-    all numbers of a group of rows. most: evaluations. positive: whether no x may become 0 or
-    less. lost: a group that ends with more than that in place of `close` has failed; by default
-    100 times `close`. turned: tells, after an evaluation, the groups whose function has changed,
-    (B,) bool."""
+    """x = function(x), from start (N, …) float64, up to |function(x) − x| ≤ close · scale(x,
+    function(x)) for all numbers of a group of rows. most: evaluations. positive: whether no x
+    may become 0 or less. lost: a group that ends with more than that in place of `close` has
+    failed; by default 100 times `close`. turned: tells, after an evaluation, the groups whose
+    function has changed, (B,) bool."""
     x, iteration = start, _Iteration(start, groups, positive)
     going = torch.ones(groups.size, dtype=torch.bool, device=x.device)
     iterations = torch.zeros(groups.size, dtype=torch.int64, device=x.device)
     far, lost = torch.zeros_like(x, dtype=torch.bool), 100 * close if lost is None else lost
     for _ in range(most):
         new = function(x)
-        residual, size = new - x, scale(x)
+        residual, size = new - x, scale(x, new)
         iterations += going
         far = ~(residual.abs() <= lost * size)
         # not a NaN, which stays one
@@ -197,7 +197,7 @@ def with_derivative(
         size = _sizes(moved, groups)
         turned = fixed_point(
             lambda y: _zero_if_none(both(function(with_tangent(x, y)))[1], y), moved,
-            lambda y: size, groups, close, most,
+            lambda y, new: size, groups, close, most,
         )  # fmt: skip
         return with_tangent(x, _nan_where(turned.failed, turned.x, groups))
     change = value - x
@@ -229,7 +229,7 @@ class _Adjoint(torch.autograd.Function):
             return grad + _zero_if_none(back, x)
 
         size = _sizes(grad, ctx.groups)
-        found = fixed_point(pulled, grad, lambda x: size, ctx.groups, close, most)
+        found = fixed_point(pulled, grad, lambda x, new: size, ctx.groups, close, most)
         return _nan_where(found.failed, found.x, ctx.groups), None, None, None, None
 
 
