@@ -109,8 +109,8 @@ def warn_of_kept(effects: Sequence[BoundEffect], state: State, own: Container[st
             if name in bound.writes() or _sets(effects, name, bound):
                 continue
             now, given = state.fields[name].detach(), field.initial(state, rows).detach()
-            owner, differ = state.groups.owner, bool((now != given.to(now.dtype)).any())
-            # cells of a colony that differ have been set one by one
+            owner, differ = state.groups.owner, bool((now != given.to(now.dtype)).all())
+            # cells of a colony that differ, and single colonies, have been set by hand
             if differ and bool((state.groups.max(now).index_select(0, owner) == now).all()):
                 warn(
                     f"This scene gives its first cells {name} = {_few(given)}; those of the state"

@@ -116,7 +116,7 @@ def test_exchange_with_a_medium_and_a_reservoir(D, dtype, plain):
     """Half of the cells are outside the box."""
     medium = tf.Medium(
         ahl=tf.Signal(diffusion=10.0, reservoir=0.5), box=((-8.0, -8.0), (24.0, 8.0)),
-        spacing=4.0, outside="reservoir",
+        spacing=4.0, outside="reservoir", exchange="turns",
     )  # fmt: skip
     circuit = tf.Circuit(exchanging, species="ahl", D=D, k=2.0)
     a, b = ends(alone(circuit, medium, types=2), dtype=dtype)

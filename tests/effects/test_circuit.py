@@ -200,6 +200,7 @@ def test_halving_the_step():
                 ahl=tf.Signal(diffusion=10.0, decay=0.5),
                 box=((-8.0, -8.0), (8.0, 8.0)),
                 spacing=2.0,
+                exchange="turns",
                 splitting=splitting,
             )
             scene = resting(circuit, 3, medium)

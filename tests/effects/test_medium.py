@@ -76,6 +76,7 @@ def test_one_voxel_relaxes_at_the_rate_of_its_membranes(count):
         box=((-4.0, -4.0), (4.0, 4.0)),
         spacing=8.0,
         depth=1.0,
+        exchange="turns",
     )
     scene = resting(medium, exchanging(D1=2.0, rtol=1e-8, atol=1e-12), cells)
     state = scene.bind(dtype=F64).start()
