@@ -128,6 +128,8 @@ def boundary_detector(
         Mechanics(dim=2, walls=[Channel(width)], length_drag=length_drag),
         circuit,
         Medium(
+            # its AHL is slow, and searches run it thousands of times
+            exchange="turns",
             ahl=Signal(diffusion=diffusion),
             box=((-128.0, -half, -24.0), (128.0, half, 24.0)),
             spacing=spacing,
