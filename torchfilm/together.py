@@ -323,7 +323,7 @@ def _by_kernels(step: _Step, close: float) -> tuple[Outcome, FixedPoint] | None:
 
 
 class _Iteration:
-    """The iteration of `_by_kernels`. x: (N, E, 2), the guesses. iterations, going, far: (B,)."""
+    """Anderson's mixing by a kernel. x: (N, E, 2), the guesses. iterations, going, far: (B,)."""
 
     def __init__(self, step: _Step, start: np.ndarray, close: float):
         self.limits = close, LOST * step.together.rtol
@@ -341,11 +341,10 @@ class _Iteration:
     def moved(self, made: PreparedStep) -> dict[str, Moved]:
         """The signals, for what cells have just released."""
         out, given = {}, dict(zip(made.names, made.released, strict=True))
+        none = np.zeros(len(self.x))
         for k, (name, transport) in enumerate(self.step.transport.items()):
-            released = given.get(name)
-            amount = transport.found.new_zeros(len(self.x)) if released is None else None
-            amount = torch.from_numpy(released) if amount is None else amount
-            out[name] = transport.moved(amount, self.x[:, k, 1])
+            released = torch.from_numpy(given.get(name, none))
+            out[name] = transport.moved(released, self.x[:, k, 1])
             self.new[:, k, 0], self.new[:, k, 1] = out[name].at_end, out[name].mean
         return out
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from exchanging_cells import BOX, F64, advance, exchanging, resting, totals
+from exchanging_cells import BOX, F64, advance, diffused, exchanging, resting, totals
 from helpers import step
 from scipy.integrate import solve_ivp
 
@@ -51,12 +51,7 @@ def exact(state: tf.State, D1: float, gain: float, diffusion: float, hours: floa
 
     def rates(t, y):
         field, ahl = y[:-count].reshape(shape), y[-count:]
-        change = -0.5 * field
-        for axis in range(3):
-            flux = np.diff(field, axis=axis) * diffusion / h**2
-            pad = [(1, 1) if k == axis else (0, 0) for k in range(3)]
-            change += np.diff(np.pad(flux, pad), axis=axis)
-        change = change.reshape(-1)
+        change = diffused(field, diffusion / h**2) - 0.5 * field.reshape(-1)
         here = (weight * y[:-count][node]).sum(1)
         into = D1 * (here - ahl) * area
         share = weight * np.where(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from exchanging_cells import BOX, F64, advance
+from exchanging_cells import BOX, F64, advance, diffused
 from helpers import step
 from scipy.integrate import solve_ivp
 
@@ -63,12 +63,7 @@ def exact(state: tf.State, diffusion: float, half: float, growth_yield: float, h
 
     def rates(t, y):
         field, volume = y[:-count].reshape(nx, ny, nz), y[-count:]
-        change = np.zeros_like(field)
-        for axis in range(3):
-            flux = np.diff(field, axis=axis) * diffusion / step_size**2
-            pad = [(1, 1) if k == axis else (0, 0) for k in range(3)]
-            change += np.diff(np.pad(flux, pad), axis=axis)
-        change = change.reshape(-1)
+        change = diffused(field, diffusion / step_size**2)
         here = (weight * y[:-count][node]).sum(1)
         growth = here / (half + here) * volume
         # as `exchange.write` shares what cells take: by what each voxel has

@@ -13,13 +13,23 @@ from torchfilm.kernels.uptake import (
     TINY,
     carry_once,
     next_guess,
+    operator_of,
     poisson,
     put_read,
+    room_for,
     with_losses,
 )
 
-# Of the rate at which a cell takes, times the step: it then takes all there is.
+# As in `signals.joint`.
 EMPTY = 1e9
+
+
+@kernel
+def put_gained(more, gained, c):
+    """What one of the grids of a shape gains without cells, of (b or 1 or 0, voxels)."""
+    more[:] = 0.0
+    if gained.shape[0] > 0:
+        more[:] = gained[c if gained.shape[0] > 1 else 0]
 
 
 @kernel
@@ -57,28 +67,17 @@ def move(
     of the mean, and what it finds at the start. settings: as of `uptake.carry_once`. far: (b,), as
     there, kept. turned: (B,) bool, set where it has changed.
     """
-    size, pad = stay.shape[1], 0
-    for stride in strides:
-        pad = max(pad, stride)
-    wide, terms = size + 2 * pad, int(settings[2] + 10 * np.sqrt(settings[2]) + 31)
-    fields, wider = np.empty((7, size)), np.zeros((7, wide))
-    loss, b, x, more = fields[0], fields[3], wider[0], fields[6]
-    room = (
-        loss, fields[1], x, fields[2], b, fields[4], fields[5], wider[2:], wider[1],
-        np.empty(terms), np.empty(terms),
-    )  # fmt: skip
-    final, mean, u = fields[4], fields[5], np.empty(size)
+    size = stay.shape[1]
+    room, pad = room_for(size, strides, settings[2])
+    loss, x, b, final, mean = room[0], room[2], room[4], room[5], room[6]
+    u, more = np.empty(size), np.empty(size)
     for c in range(begin, end):
-        own = c if stay.shape[0] > 1 else 0
         colony, start = colonies[c], starts[c]
         first, last = ends[colony], ends[colony + 1]
-        operator = (
-            strides, stay[own], ups[own], downs[own], wrap_to, wrap_from, wraps[own], rate[own],
-            symmetric,
-        )  # fmt: skip
-        more[:] = 0.0
-        if gained.shape[0] > 0:
-            more[:] = gained[c if gained.shape[0] > 1 else 0]
+        operator = operator_of(
+            c, strides, stay, ups, downs, wrap_to, wrap_from, wraps, rate, symmetric
+        )
+        put_gained(more, gained, c)
         cells = slice(first, last)
         place = node[cells], weight[cells], start
         per_voxel, rates = 1 / (voxel_volume * dt), taken[cells]
@@ -208,29 +207,18 @@ def move_turned(
     given, guess, average (N,), values and far (b,) as `move` had or left them. Whether all solves
     converged is in the numbers: NaN where not.
     """
-    size, pad = stay.shape[1], 0
-    for stride in strides:
-        pad = max(pad, stride)
-    wide, terms = size + 2 * pad, int(settings[2] + 10 * np.sqrt(settings[2]) + 31)
-    fields, wider = np.empty((11, size)), np.zeros((7, wide))
-    loss, more, dloss, dmore = fields[0], fields[6], fields[7], fields[8]
-    u, du = fields[9], fields[10]
-    room = (
-        loss, fields[1], wider[0], fields[2], fields[3], fields[4], fields[5], wider[2:], wider[1],
-        np.empty(terms), np.empty(terms),
-    )  # fmt: skip
-    final, mean, weights, tails = fields[4], fields[5], room[9], room[10]
+    size = stay.shape[1]
+    room, pad = room_for(size, strides, settings[2])
+    loss, final, mean, weights, tails = room[0], room[5], room[6], room[9], room[10]
+    own = np.empty((5, size))
+    u, du, more, dmore, dloss = own[0], own[1], own[2], own[3], own[4]
     per_voxel, rates, drates = 1 / (voxel_volume * dt), np.empty(given.size), taken
     for c in range(begin, end):
-        own = c if stay.shape[0] > 1 else 0
         start, cells = starts[c], slice(ends[colonies[c]], ends[colonies[c] + 1])
-        operator = (
-            strides, stay[own], ups[own], downs[own], wrap_to, wrap_from, wraps[own], rate[own],
-            symmetric,
-        )  # fmt: skip
-        more[:] = 0.0
-        if gained.shape[0] > 0:
-            more[:] = gained[c if gained.shape[0] > 1 else 0]
+        operator = operator_of(
+            c, strides, stay, ups, downs, wrap_to, wrap_from, wraps, rate, symmetric
+        )
+        put_gained(more, gained, c)
         place = node[cells], weight[cells], start
         put_shares(more, loss, rates[cells], given[cells], guess[cells], fed[cells], *place,
                    per_voxel, EMPTY / dt)  # fmt: skip

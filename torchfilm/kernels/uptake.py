@@ -99,6 +99,32 @@ def series(u, pad, grid, weights, tails, used, gained, times, end, mean, spare):
 
 
 @kernel
+def room_for(size, strides, events):
+    """What `carry_once` works in, for grids of so many voxels, and the padding. events: the most of
+    a series."""
+    pad = 0
+    for stride in strides:
+        pad = max(pad, stride)
+    terms = int(events + 10 * np.sqrt(events) + 31)
+    fields, wider = np.empty((6, size)), np.zeros((7, size + 2 * pad))
+    room = (
+        fields[0], fields[1], wider[0], fields[2], fields[3], fields[4], fields[5], wider[2:],
+        wider[1], np.empty(terms), np.empty(terms),
+    )  # fmt: skip
+    return room, pad
+
+
+@kernel
+def operator_of(c, strides, stay, ups, downs, wrap_to, wrap_from, wraps, rate, symmetric):
+    """The operator of one of the grids of a shape, as `carry_once` takes it; they may share it."""
+    own = c if stay.shape[0] > 1 else 0
+    return (
+        strides, stay[own], ups[own], downs[own], wrap_to, wrap_from, wraps[own], rate[own],
+        symmetric,
+    )  # fmt: skip
+
+
+@kernel
 def with_losses(dt, operator, room, settings):
     """The greatest rate at which a voxel of a grid loses, with the losses in room; λ; and the
     operator at this λ, which uses `still` of the room."""
@@ -182,7 +208,7 @@ def next_guess(mean, new, memory, changes, matrix, right, half, fed, close, lost
         size += off * off
     if done:
         return done, near
-    if not size <= WORSE * control[1]:  # begin again from the best guess, more carefully
+    if not near and not size <= WORSE * control[1]:  # from the best guess again, more carefully
         control[0], control[2] = 0, 0.5 * control[2]
         for i in range(mean.size):
             mean[i] = memory[2, i] + control[2] * (memory[3, i] - memory[2, i])
@@ -273,25 +299,15 @@ def eat(
     most iterations, and of the series and the solve: 1.01, cut, most events, tolerance, rounding,
     most.
     """
-    size, pad = stay.shape[1], 0
-    for stride in strides:
-        pad = max(pad, stride)
-    wide, terms = size + 2 * pad, int(settings[2][2] + 10 * np.sqrt(settings[2][2]) + 31)
-    fields, wider = np.empty((6, size)), np.zeros((7, wide))
-    b, x = fields[3], wider[0]
-    room = (
-        fields[0], fields[1], x, fields[2], b, fields[4], fields[5], wider[2:], wider[1],
-        np.empty(terms), np.empty(terms),
-    )  # fmt: skip
-    u = np.empty(size)
+    size = stay.shape[1]
+    room, pad = room_for(size, strides, settings[2][2])
+    x, b, u = room[2], room[4], np.empty(size)
     for c in range(begin, end):
-        own = c if stay.shape[0] > 1 else 0
         colony, start = colonies[c], starts[c]
         first, last = ends[colony], ends[colony + 1]
-        operator = (
-            strides, stay[own], ups[own], downs[own], wrap_to, wrap_from, wraps[own], rate[own],
-            symmetric,
-        )  # fmt: skip
+        operator = operator_of(
+            c, strides, stay, ups, downs, wrap_to, wrap_from, wraps, rate, symmetric
+        )
         more = gained[c if gained.shape[0] > 1 else 0] if gained.shape[0] > 0 else u[:0]
         for i in range(size):
             u[i] = b[i] = x[pad + i] = values[start + i]

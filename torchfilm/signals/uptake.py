@@ -100,6 +100,7 @@ def solve(
         fixed = fixed_point(
             lambda x: both(step(x)[1])[0], both(found)[0],
             lambda x, new: half + torch.maximum(x, new), eaters.groups, CLOSE, MOST, positive=True,
+            turned=step.turned,
         )  # fmt: skip
     mean = fixed.x
     if tracked(field, found, *numbers, *(x for one in carried for x in one.numbers())):
@@ -125,15 +126,22 @@ class _Step:
         self.field, self.found = field, found
         # once a colony needs backward Euler it keeps to it, or the two would alternate
         self.far: list[Tensor | None] = [None] * len(carried)
+        self._turned = torch.zeros(eaters.groups.size, dtype=torch.bool, device=field.device)
+
+    def turned(self) -> Tensor:
+        """The colonies whose equation has changed in the last call, (B,) bool."""
+        return self._turned
 
     def __call__(self, mean: Tensor) -> tuple[Tensor, Tensor]:
         eaters, grid = self.eaters, self.grid
         losses = eaters.losses(eaters.taking(mean))
         ends, means = [], []
         for k, (one, batch) in enumerate(zip(self.carried, grid.batches, strict=True)):
-            end, average, self.far[k] = one.step(
-                batch.of(self.field), batch.of(losses), eaters.dt, self.far[k]
-            )
+            before = self.far[k]
+            end, average, far = one.step(batch.of(self.field), batch.of(losses), eaters.dt, before)
+            if before is not None:
+                self._turned[batch.colonies] = far & ~before
+            self.far[k] = far
             ends.append(end)
             means.append(average)
         read = eaters.read(grid.join(means))

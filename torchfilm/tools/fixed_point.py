@@ -63,7 +63,7 @@ def fixed_point(
             break
         if turned is not None:
             iteration.forget(turned())
-        ahead = iteration.next(x, new, 1 / size)
+        ahead = iteration.next(x, new, 1 / size, groups.any(_any(far)))
         x = torch.where(iteration.each(going), ahead, x)
     return FixedPoint(x, iterations, groups.any(_any(far)))
 
@@ -100,13 +100,14 @@ class _Iteration:
         kept = lambda x: torch.where(none, 0.0, x)
         self.earlier = [(kept(a), kept(b)) for a, b in self.earlier]
 
-    def next(self, x: Tensor, new: Tensor, weight: Tensor) -> Tensor:
-        """The next guess (N, …), after x gave `new`. weight: 1 over the scale."""
+    def next(self, x: Tensor, new: Tensor, weight: Tensor, far: Tensor) -> Tensor:
+        """The next guess (N, …), after x gave `new`. weight: 1 over the scale. far: (B,) bool,
+        groups that may begin again: near the solution roundings may leave more than the least."""
         residual, groups = new - x, self.groups
         square = (residual * weight) ** 2
         square = square if x.dim() == 1 else sum_in_order(square.flatten(1))
         norm = groups.sum(square.unsqueeze(1)).squeeze(1)
-        worse = ~(norm <= WORSE * self.least)
+        worse = far & ~(norm <= WORSE * self.least)
         better = norm < self.least
         self.part = torch.where(worse, 0.5 * self.part, self.part)
         self.part = torch.where(better, (2 * self.part).clamp(max=1.0), self.part)
