@@ -29,6 +29,7 @@ def solved(monkeypatch):
     """Exchange and transport solved far closer than the circuits' tolerance, which is wide here so
     that differences see the same steps: or they would see the iteration."""
     monkeypatch.setattr(together, "PART", 1e-8)
+    monkeypatch.setattr(together, "FINE", 1e-8)
 
 
 def lux(u, s, p, cell):

@@ -25,14 +25,14 @@ from torchfilm.signals.joint import JointTransport, Moved
 from torchfilm.state import CELL, GRID, OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.fixed_point import DEPTH, FixedPoint, fixed_point, with_derivative
-from torchfilm.tools.tangents import both, no_derivatives, tracked
+from torchfilm.tools.tangents import both, in_forward_mode, no_derivatives, scaled, tangent, tracked
 from torchfilm.tools.threads import Shared
 from torchfilm.tools.timing import Timings
 
-# Iterations end where concentrations change by PART of the circuits' tolerance, or by FINE where
-# derivatives are wanted; they have failed if they do by LOST of it. MOST: iterations; a few are
-# usual.
-PART, FINE, LOST = 0.3, 1e-9, 10.0
+# Iterations end where concentrations change by PART of the circuits' tolerance, or by FINE of it
+# where derivatives are wanted, as do those for the derivatives; they have failed if they do by
+# LOST of it. MOST: iterations; a few are usual.
+PART, FINE, LOST = 0.3, 1e-3, 10.0
 MOST = 50
 # Parts of a step into which a colony may divide it. ROUNDED: see `profile`.
 FINEST = 16
@@ -204,7 +204,7 @@ class _Step:
 
     def __call__(self, x: Tensor) -> Outcome:
         state, names = self.state, self.together.names
-        released = {n: torch.zeros_like(self.first[n]) for n in names}
+        released: dict[str, Tensor] = {}
         reports = []
         for circuit in self.together.circuits:
             reports.append(self.report(circuit))
@@ -215,7 +215,8 @@ class _Step:
                 )
                 state = state.with_fields(**changed)
                 given = around.released
-                released |= {n: released[n] + y for n, y in given.items() if n in released}
+                released |= {n: released[n] + y if n in released else y for n, y in given.items()}
+        released = {n: released.get(n, torch.zeros_like(self.first[n])) for n in names}
         moved = {n: self.transport[n].moved(released[n], x[:, k, 1]) for k, n in enumerate(names)}
         return Outcome(state, released, moved, reports)
 
@@ -235,17 +236,22 @@ class _Step:
         """Where the iteration ends."""
         return PART * self.together.rtol
 
+    @property
+    def fine(self) -> float:
+        """Where it ends, and those for derivatives do, where these are wanted."""
+        return FINE * self.together.rtol
+
 
 def profile(x: Tensor, dt: float, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
     """What cells find over a step of dt hours, that ends where x (N, 2) says and has its mean: the
     begin of a line, its middle, and its slope, (N,) each. Where the mean is below half the end, the
     line begins at 0. By its rounding it does not go below 0."""
     end, mean = x.unbind(1)
-    begin = (2 * mean - end).clamp(min=0.0).to(dtype)
-    least = -begin.double() * (1 - ROUNDED)
+    begin = (mean + mean - end).clamp(min=0.0).to(dtype)
+    least = scaled(begin.double(), ROUNDED - 1)
     change = end - begin
     change = torch.where(change < least, least, change)
-    return begin, (begin + 0.5 * change).to(dtype), (change / dt).to(dtype)
+    return begin, (begin + scaled(change, 0.5)).to(dtype), scaled(change, 1 / dt).to(dtype)
 
 
 def _solved(make: Callable[[], _Step]) -> tuple[_Step, Outcome, FixedPoint]:
@@ -254,16 +260,24 @@ def _solved(make: Callable[[], _Step]) -> tuple[_Step, Outcome, FixedPoint]:
     step = make()
     if (found := _by_kernels(step, step.close)) is not None:
         return step, *found
-    outcome = step(step.start())
-    if not outcome.tracked(step.state):
-        return step, *_by_torch(step, step.close, outcome)
+    if not in_forward_mode():
+        outcome = step(step.start())
+        if not outcome.tracked(step.state):
+            return step, *_by_torch(step, step.close, outcome)
     with no_derivatives():
         bare = make()
-        _, fixed = _by_kernels(bare, FINE) or _by_torch(bare, FINE)
-    x = with_derivative(
-        lambda x: step(x).found(), fixed.x, step.state.groups, FINE, MOST, "exchange of signals"
-    )
-    return step, step(x), fixed
+        _, fixed = _by_kernels(bare, step.fine) or _by_torch(bare, step.fine)
+    last: list[Outcome] = []
+
+    def tried(x: Tensor) -> Tensor:
+        last[:] = [step(x)]
+        return last[0].found()
+
+    x = with_derivative(tried, fixed.x, step.state.groups, step.fine, MOST, "exchange of signals")
+    # tangents end where they were last tried, unless they have failed
+    turned = tangent(x) if in_forward_mode() else None
+    known = turned is not None and bool(turned.isfinite().all())
+    return step, last[0] if known else step(x), fixed
 
 
 def _by_torch(

@@ -66,6 +66,7 @@ def test_the_gradient_of_a_replay_equals_differences(circuit, monkeypatch):
     """
     # or differences would see where the solve of exchange and transport ends
     monkeypatch.setattr(together, "PART", 1e-8)
+    monkeypatch.setattr(together, "FINE", 1e-8)
     controller = Controller()
     replay = replay_of(controller, **circuit)
     with torch.no_grad():

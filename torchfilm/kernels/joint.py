@@ -11,6 +11,7 @@ from torchfilm.kernels.transport_solve import backward_euler
 from torchfilm.kernels.uptake import (
     DEPTH,
     TINY,
+    add_scaled,
     carry_once,
     next_guess,
     operator_of,
@@ -130,13 +131,13 @@ def mix(begin, end, ends, width, x, new, memory, changes, control, size, fed, se
 
 
 @kernel
-def turned_series(u, du, pad, grid, weights, tails, used, gained, dgained, dloss, at, end, mean,
+def turned_series(u, du, pad, grid, weights, tails, used, gained, dgained, slower, end, mean,
                   spare):  # fmt: skip
     """The tangents of `uptake.series` of one grid, to end and mean: of u, of what is gained, 1/λ,
-    and of the losses, whose λ is `at`. spare: four rows, 0 in their padding."""
+    and of the losses, 1/λ, `slower`. spare: four rows, 0 in their padding."""
     strides, stay, ups, downs, wrap_to, wrap_from, wraps, _ = grid
-    v, new, w, turn = spare[0], spare[1], spare[2], spare[3]
-    for i in range(end.size):
+    v, new, w, turn, size = spare[0], spare[1], spare[2], spare[3], end.size
+    for i in range(size):
         v[pad + i], w[pad + i] = u[i], du[i]
         end[i], mean[i] = weights[0] * du[i], tails[0] * du[i]
     for n in range(1, used):
@@ -145,12 +146,12 @@ def turned_series(u, du, pad, grid, weights, tails, used, gained, dgained, dloss
         for k in range(wrap_to.size):
             new[pad + wrap_to[k]] += wraps[k] * v[pad + wrap_from[k]]
             turn[pad + wrap_to[k]] += wraps[k] * w[pad + wrap_from[k]]
-        for i in range(gained.size):
-            new[pad + i] += gained[i]
-        for i in range(end.size):
-            turn[pad + i] += dgained[i] - dloss[i] / at * v[pad + i]
-            end[i] += weights[n] * turn[pad + i]
-            mean[i] += tails[n] * turn[pad + i]
+        before, after, inner = v[pad : pad + size], new[pad : pad + size], turn[pad : pad + size]
+        add_scaled(after, 1.0, gained)
+        for i in range(size):
+            inner[i] += dgained[i] - slower[i] * before[i]
+        add_scaled(end, weights[n], inner)
+        add_scaled(mean, tails[n], inner)
         v, new, w, turn = new, v, turn, w
 
 
@@ -237,7 +238,7 @@ def move_turned(
                                 settings[5])  # fmt: skip
         else:
             used = poisson(times, settings[1], weights, tails)
-            turned_series(u, du, pad, grid, weights, tails, used, more / at, dmore / at, dloss, at,
+            turned_series(u, du, pad, grid, weights, tails, used, more / at, dmore / at, dloss / at,
                           final, mean, room[7])  # fmt: skip
             for i in range(size):
                 mean[i] /= times

@@ -76,25 +76,32 @@ def put_read(new, field, node, weight, start):
 
 
 @kernel
+def add_scaled(total, part, values):
+    """total += part · values."""
+    for i in range(total.size):
+        total[i] += part * values[i]
+
+
+@kernel
 def series(u, pad, grid, weights, tails, used, gained, times, end, mean, spare):
     """`Eaten._series` for one grid: from u (padded) to end and mean. gained: q/λ or empty. times:
     λΔt."""
     strides, stay, ups, downs, wrap_to, wrap_from, wraps, _ = grid
-    v, new = spare[0], spare[1]
-    for i in range(end.size):
+    v, new, size = spare[0], spare[1], end.size
+    for i in range(size):
         v[pad + i] = u[i]
         end[i], mean[i] = weights[0] * u[i], tails[0] * u[i]
     for n in range(1, used):
         exchanged(v, new, pad, strides, stay, ups, downs)
         for w in range(wrap_to.size):
             new[pad + wrap_to[w]] += wraps[w] * v[pad + wrap_from[w]]
+        inner = new[pad : pad + size]  # a sum of two numbers as index costs several times as much
         for i in range(gained.size):
-            new[pad + i] += gained[i]
-        for i in range(end.size):
-            end[i] += weights[n] * new[pad + i]
-            mean[i] += tails[n] * new[pad + i]
+            inner[i] += gained[i]
+        add_scaled(end, weights[n], inner)
+        add_scaled(mean, tails[n], inner)
         v, new = new, v
-    for i in range(end.size):
+    for i in range(size):
         mean[i] /= times
 
 

@@ -91,10 +91,11 @@ def with_tangent(value: Tensor, moved: Tensor | None) -> Tensor:
     return value if moved is None else forward_ad.make_dual(value, moved)
 
 
-def scaled(value: Tensor, factor: Tensor) -> Tensor:
+def scaled(value: Tensor, factor: Tensor | float) -> Tensor:
     """value · factor. Where only the value carries a tangent, torch would work out the other half
     of the product rule, which is 0, in Python: half a millisecond a product."""
-    if not in_forward_mode() or has_tangent(factor) or not only_forward(value):
+    own = isinstance(factor, Tensor) and has_tangent(factor)
+    if not in_forward_mode() or own or not only_forward(value):
         return value * factor
     plain, moved = both(value)
     assert moved is not None
