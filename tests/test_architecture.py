@@ -46,8 +46,11 @@ ROOMS = {
             "torchfilm.parameters",
             "torchfilm.effect",
             "torchfilm.own_step",
+            "torchfilm.reports",
+            "torchfilm.cell_types",
             "torchfilm.medium_exchange",
             "torchfilm.rule_values",
+            "torchfilm.rule_draws",
             "torchfilm.rule_views",
         ),
     ),
@@ -80,7 +83,7 @@ ONE_EFFECT = [
         " circuit_sbml circuit_words",
         "division compiled_division",
         "medium bound_medium medium_transport",
-        "rules bound_rules",
+        "rules bound_rules bound_division_rule",
         "mechanics bound_mechanics mechanics_report",
     )
 ]

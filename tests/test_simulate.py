@@ -13,8 +13,8 @@ import torch
 from running import alone, scene_of
 
 import torchfilm as tf
-from torchfilm.effect import Concern
 from torchfilm.physics.problem import CONVERGED
+from torchfilm.reports import Concern
 from torchfilm.state import PER_CELL
 
 

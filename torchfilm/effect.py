@@ -10,12 +10,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
-
-import torch
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from torchfilm import own_step
 from torchfilm.parameters import summary
@@ -162,6 +160,15 @@ class Effect(metaclass=checks.KnownKeywords):
 
     def writes(self) -> Sequence[str]:
         """Names of what `step` changes."""
+        return ()
+
+    def keeps(self) -> Mapping[str, str]:
+        """The declared fields in which cells keep a physical value of this effect, by the value's
+        name; beside `kept_values`."""
+        return {}
+
+    def at_least_zero(self) -> Sequence[str]:
+        """Fields and variables that it reads, and that must not be below 0."""
         return ()
 
     def waits_for(self) -> Mapping[str, str]:
@@ -407,32 +414,3 @@ def makes_longer(effect: Effect) -> bool:
     """Whether cells may become longer by this effect, or be flagged to divide at any length."""
     grows = any(f.name == "elongation" for f in effect.declares(3))
     return grows or effect.writes_anything or is_own(effect)
-
-
-class Report(Protocol):
-    """What a step of an effect tells of itself. A driver raises, or drops colonies, where `status`
-    is not 0. A report may also have `concerns() -> list[Concern]`."""
-
-    @property
-    def status(self) -> torch.Tensor:
-        """(B,) int: 0 where all is well."""
-
-    @property
-    def hint(self) -> str:
-        """What may help where it is not."""
-
-    def reason(self, place: int) -> str:
-        """What went wrong in the colony at this place of the batch."""
-
-
-@dataclass(frozen=True)
-class Concern:
-    """What a report warns of, once it has held for `steps` steps: in which colonies, `where` (B,)
-    bool, and `text(colony ids (B,), where (B,))`, what is wrong and what to do. name:
-    distinguishes concerns.
-    """
-
-    name: str
-    where: torch.Tensor
-    steps: int
-    text: Callable[[torch.Tensor, torch.Tensor], str]

@@ -145,7 +145,8 @@ class Cells(metaclass=checks.KnownKeywords):
             index = np.tile(np.arange(self.count), colonies)
             colony = np.repeat(np.arange(colonies), self.count)
         else:
-            colonies = self.batch_size(colonies)
+            if (colonies := self.batch_size(colonies)) > self.colonies:
+                _warn_of_empty(self, colonies)
             index = np.argsort(self.colony, kind="stable")
             colony = self.colony[index]
         counts = np.bincount(colony, minlength=colonies)
@@ -391,11 +392,11 @@ def _check_colonies(colony: np.ndarray) -> None:
         )
 
 
-def _warn_of_empty(cells: Cells) -> None:
-    """Warn of numbers of colonies between those of a table without a cell."""
+def _warn_of_empty(cells: Cells, colonies: int = 0) -> None:
+    """Warn of colonies without a cell: of those up to the greatest number, or of more."""
     if cells.colony is None:
         return
-    counts = np.bincount(cells.colony)
+    counts = np.bincount(cells.colony, minlength=colonies)
     empty, there = np.flatnonzero(counts == 0), np.flatnonzero(counts)
     if empty.size:
         warn(

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfilm.effect import Concern, Report
+from torchfilm.reports import Concern, Report
 from torchfilm.state import State
 from torchfilm.tools.checks import SimulationError
 from torchfilm.tools.warn_once import warn
@@ -96,7 +96,7 @@ class Failure:
 def failures(state: State) -> list[Failure]:
     """The colonies whose last step failed, once for each reason: a solve that did not converge, a
     cell too short to divide, a circuit whose rates are not finite. The reports are those of
-    `torchfilm.effect.Report`."""
+    `torchfilm.reports.Report`."""
     found = []
     report: Report
     for report in state.reports.values():

@@ -26,12 +26,16 @@ def check_integers(name: str, tensor: Tensor, dtype: torch.dtype) -> None:
         if odd.numel():
             raise RuleError(
                 f"{name} is True or False for each cell; got {float(odd.reshape(-1)[0]):g}. For a"
-                " probability write cells.random() < 0.02."
+                " probability write cells.chance(0.02)."
             )
     elif tensor.is_floating_point() and not bool((tensor == tensor.round()).all()):
         raise RuleError(
-            f"{name} is an integer field; got non-integers. Give it a first value such as 0.0 if it"
-            " should take any number."
+            f"{name} takes whole numbers, and got {float(tensor[tensor != tensor.round()][0]):g}."
+            + (
+                ""
+                if name.endswith("cell_type")
+                else " Give it a first value such as 0.0 if it should take any number."
+            )
         )
 
 

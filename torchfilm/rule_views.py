@@ -6,6 +6,7 @@ Rules may read every name, and write those that the model allows.
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -13,8 +14,10 @@ from torch import Tensor
 
 from torchfilm.circuits.names import Names
 from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.rule_draws import Draws
 from torchfilm.rule_values import RuleError, as_tensor, broadcast_copy, check_integers, real_column
 from torchfilm.state import CELL, CELL_TYPE, COLONY, OUTSIDE, Field, State
+from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import unchanged
 
 # The paper's names (Table 1) and ours.
@@ -37,6 +40,7 @@ MEANS = {
 IDENTITY = ("uid", "parent", "colony")
 # fields that only an effect acts on
 OF_EFFECTS = {"growth_rate": "tf.Growth()", "divide_flag": "tf.Division()"}
+SECRETES = "a circuit says what cells give to a signal and take from it"
 KNOWN_FIELDS = {
     "cell_type": CELL_TYPE,
     "drag": Field("drag", "factor on the viscosity that this cell feels", initial=1.0),
@@ -53,7 +57,22 @@ def _quantity(state: State, name: str) -> Tensor:
     return state.own_colony_id if name == "colony" else getattr(state, name)
 
 
-class CellsView:
+def _known_names(state: State) -> list[str]:
+    """What rules can read of the cells, but what serves the numerics."""
+    fields = [
+        n
+        for n, f in state.declared.items()
+        if n.isidentifier() and (n in OF_EFFECTS or not f.internal)
+    ]
+    return [*GEOMETRY, *IDENTITY, *fields]
+
+
+def _near(name: str, known: Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, known, 1, cutoff=0.75)
+    return f" Did you mean {near[0]!r}?" if near else ""
+
+
+class CellsView(Draws):
     """The cells as a rule sees them: every name is a tensor over all cells, (N,) or (N, d).
 
     `for cell in cells` gives them one by one (slow). A rule may read position (pos), axis (dir),
@@ -63,7 +82,6 @@ class CellsView:
     """
 
     _state: State
-    _label: str
     _dt: float
     _work: dict[str, Tensor]
     _read: set[str]
@@ -76,7 +94,8 @@ class CellsView:
         # bypasses __setattr__, which is for rules
         self.__dict__.update(
             _state=state,
-            _label=label,
+            _rows=None,
+            _purpose=label,
             _dt=dt,
             _work={},
             _read=set(),
@@ -140,9 +159,10 @@ class CellsView:
                 raise RuleError(
                     f"cells have no {name!r}; it is a signal: read cells.signals.{name}."
                 )
-            known = [*GEOMETRY, *IDENTITY, *(n for n in state.fields if n.isidentifier())]
+            known = _known_names(state)
             raise RuleError(
-                f"cells have no {name!r}; they have {', '.join(known)}. A variable of your own"
+                f"cells have no {name!r}; they have {', '.join(known)}.{_near(name, known)} A"
+                " variable of your own"
                 f" needs a first value: give Rules(…, variables={{{name!r}: 0.0}})."
             )
         return self._work[name]
@@ -155,7 +175,7 @@ class CellsView:
         self._read.update(("position", *(n for n in state.fields if n.startswith(OUTSIDE))))
         contact = state.contact()
         assert contact is not None
-        return Names(tuple(contact.found), list(contact.found.values()), "cells.signals")
+        return Names(tuple(contact.found), list(contact.found.values()), "cells.signals", SECRETES)
 
     def __setattr__(self, name: str, value: Any) -> None:
         name = PAPER_NAMES.get(name, name)
@@ -206,17 +226,6 @@ class CellsView:
     def __iter__(self):
         return (CellView(self, k) for k in range(self._state.cells))
 
-    def random(self) -> Tensor:
-        """One draw from (0, 1) for each cell, (N,), keyed by seed, colony, cell and step.
-
-        It does not depend on the batch. Each call gives new numbers.
-        """
-        self.__dict__["_draws"] += 1
-        return self._state.uniform(
-            torch.arange(self._state.cells, device=self._state.device),
-            f"{self._label} {self._draws}",
-        )
-
     def colony_max(self, value: Tensor) -> Tensor:
         """The greatest value in each cell's own colony, (N,) -> (N,)."""
         value = real_column("colony_max", value, self._state)
@@ -233,10 +242,14 @@ class CellsView:
         return total.index_select(0, self._state.colony)
 
     def contacts(self, within: float = 0.05) -> tuple[Tensor, Tensor]:
-        """Pairs of cells whose surfaces are at most `within` µm apart: two (P,) index tensors.
+        """Pairs of cells of one colony whose surfaces are at most `within` µm apart: two (P,)
+        tensors i, j of places among the cells.
 
-        Each pair occurs once. The search runs only when a rule calls this.
+        Each pair occurs once, in either order: what goes from cell to cell both ways needs both
+        (i, j) and (j, i). The search runs only when a rule calls this.
         """
+        if not (isinstance(within, (int, float)) and within >= 0):
+            raise checks.input_error("contacts(within)", within, "a distance in µm, 0 or more")
         self._read.update(("position", "axis", "length", "radius"))
         s = self._state
         i, j, gap = gaps_nearby(
@@ -299,7 +312,7 @@ class CellView:
             setattr(cells, name, value)  # raises RuleError with the reason
 
 
-class DivisionView:
+class DivisionView(Draws):
     """The parents or the daughters of one step's divisions, M of each.
 
     The names are those of CellsView. Fields of daughters may be written, or changed in place.
@@ -324,9 +337,9 @@ class DivisionView:
             raise AttributeError(name)
         if name not in self._work:
             if not (name in GEOMETRY or name in IDENTITY or name in self._state.fields):
+                known = _known_names(self._state)
                 raise RuleError(
-                    f"cells have no {name!r}; they have"
-                    f" {', '.join([*GEOMETRY, *IDENTITY, *self._state.fields])}"
+                    f"cells have no {name!r}; they have {', '.join(known)}.{_near(name, known)}"
                 )
             self._work[name] = self._copy(name)
         return self._work[name]
@@ -379,22 +392,17 @@ class DivisionView:
                 " `fraction` divides the length); rules set fields."
             )
         if not self._writable(name):
-            own = ", ".join(filter(self._writable, self._state.fields))
+            own = ", ".join(filter(self._writable, _known_names(self._state)))
+            first = (
+                "give the first cells a type: founders=tf.Cells(…, cell_type=[0])"
+                if name == "cell_type"
+                else f"a variable needs a first value: give Rules(…, variables={{{name!r}: 0.0}})"
+            )
             raise RuleError(
                 f"daughters have no field {name!r} to write (a colony's can only be read); they"
-                f" have {own}"
+                f" have {own}. If it is new, {first}."
             )
         like = getattr(self, name)
         tensor = as_tensor(f"{self._name}.{name}", value, like.device)
         self._work[name] = broadcast_copy(f"{self._name}.{name}", tensor, like.dtype, like.shape)
         self._set.add(name)
-
-    def random(self) -> Tensor:
-        """A draw from (0, 1) for each division, (M,), keyed by seed, colony, cell and step."""
-        self.__dict__["_draws"] += 1
-        rows = (
-            self._rows
-            if self._rows is not None
-            else torch.arange(self._state.cells, device=self._state.device)
-        )
-        return self._state.uniform(rows, f"{self._purpose} {self._draws}")

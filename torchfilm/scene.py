@@ -299,7 +299,8 @@ def _check_fields(effects: Sequence[Effect], dim: int, founders: Cells) -> dict[
                     + (
                         _signal_hint(name.removeprefix(OUTSIDE), declared)
                         if name.startswith(OUTSIDE)
-                        else ""
+                        else f" A variable of rules needs a first value for it: tf.Rules(…,"
+                        f" variables={{{name!r}: 1.0}})."
                     )
                 )
     return names

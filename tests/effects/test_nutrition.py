@@ -3,6 +3,7 @@ is short, and what a scene refuses."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -305,3 +306,58 @@ def test_a_step_in_which_a_fed_cell_more_than_doubles_is_refused():
     scene = eating(tf.Monod("food", rate=[0.5, 60.0]), more=(tf.Division(length=3.0),))
     with pytest.raises(InputError, match=r"too long for Monod\.rate = 60/h"):
         tf.simulate(scene, until=0.05)
+
+
+def test_a_factor_slows_growth_and_uptake():
+    """Cells far apart, in plenty: the half-speed one eats what is worth half the growth."""
+
+    def burden(cells):
+        cells.vigour = torch.where(cells.cell_type == 1, 0.5, cells.vigour)
+
+    two = tf.Cells([[-9.0, 0.0], [9.0, 0.0], [0.0, 9.0]], [[1.0, 0.0]] * 3, cell_type=[0, 1, 0])
+    founders = dataclasses.replace(two, extra={"vigour": [1.0, 1.0, 0.0]})
+    scene = tf.Scene(
+        tf.Rules(burden, variables={"vigour": 1.0}),
+        tf.Monod("food", rate=0.8, half=1e-6, growth_yield=2.0, factor="vigour"), tf.Growth(),
+        tf.Medium(
+            food=tf.Signal(diffusion=50.0, initial=10.0), box=((-20.0, -20.0), (20.0, 20.0)),
+            spacing=4.0,
+        ),
+        dim=2, founders=founders,
+    )  # fmt: skip
+    state = scene.bind(dtype=torch.float64).start()
+    before = state.volume
+    after = step(scene, state, 0.1)
+    assert after.growth_rate.tolist() == pytest.approx([0.8, 0.4, 0.0], rel=1e-6, abs=1e-12)
+    gained = (after.volume - before) / 2.0
+    assert after.food_eaten.tolist() == pytest.approx(gained.tolist(), rel=1e-6, abs=1e-12)
+
+
+def test_rules_that_set_the_rate_of_a_fed_cell_are_refused():
+    def stop(cells):
+        cells.growth_rate = torch.where(cells.length > 3.0, 0.0, cells.growth_rate)
+
+    def at_birth(parent, daughter1, daughter2):
+        daughter1.growth_rate = 0.5 * parent.growth_rate
+
+    medium = tf.Medium(
+        food=tf.Signal(diffusion=50.0, initial=1.0), box=((-20.0, -20.0), (20.0, 20.0)), spacing=4.0
+    )
+    fed = tf.Monod("food"), tf.Growth(), medium, tf.Division(length=4.0)
+    for rules in (tf.Rules(stop), tf.Rules(None, at_birth)):
+        with pytest.raises(tf.InputError, match=r"which Monod sets again in every step.*factor="):
+            tf.Scene(rules, *fed, dim=2).bind()
+    with pytest.raises(tf.InputError, match=r"variables=\{'vigour': 1.0\}"):
+        tf.Scene(tf.Monod("food", factor="vigour"), *fed[1:], dim=2)
+    with pytest.raises(tf.InputError, match=r"Monod\.factor = 0.5 is not allowed"):
+        tf.Monod("food", factor=0.5)
+
+    def below(cells):
+        cells.vigour = cells.vigour - 2.0
+
+    scene = tf.Scene(
+        tf.Rules(below, variables={"vigour": 1.0}), tf.Monod("food", factor="vigour"), *fed[1:],
+        dim=2,
+    )  # fmt: skip
+    with pytest.raises(tf.SimulationError, match="vigour of cell 0 was set to -1: it must be at"):
+        list(tf.simulate(scene, until=0.1))

@@ -300,7 +300,9 @@ def test_a_flag_is_true_or_false_and_no_probability(flag, number):
 
     for rule in (update, one_by_one):
         scene = growing(tf.Rules(rule), tf.Division(length=4.0))
-        with pytest.raises(tf.InputError, match=rf"{flag} is True or False.*cells\.random\(\)"):
+        with pytest.raises(
+            tf.InputError, match=rf"{flag} is True or False.*cells\.chance\(0\.02\)"
+        ):
             scene.bind().start()
 
 

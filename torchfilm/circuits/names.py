@@ -19,14 +19,22 @@ class Names:
     """Read-only names for columns: `u.ahl`, or `u["ahl"]` for a name that is computed at run time.
 
     order: the names. columns: one for each name, as a tensor (M, K) or a sequence of tensors or
-    numbers. label: the name of this object in messages.
+    numbers. label: the name of this object in messages; why: nothing may be written to it.
     """
 
-    __slots__ = ("__dict__", "_label")
+    __slots__ = ("__dict__", "_label", "_why")
     _label: str
+    _why: str
 
-    def __init__(self, order: Sequence[str], columns: Tensor | Sequence[Any], label: str = "this"):
+    def __init__(
+        self,
+        order: Sequence[str],
+        columns: Tensor | Sequence[Any],
+        label: str = "this",
+        why: str = "a rate function returns rates and changes nothing",
+    ):
         object.__setattr__(self, "_label", label)
+        object.__setattr__(self, "_why", why)
         # the columns are the instance's own attributes, so access costs as much as for any
         # attribute
         self.__dict__.update(
@@ -43,10 +51,7 @@ class Names:
         return getattr(self, name)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        raise UnknownName(
-            f"{self._label}.{name} can only be read: a rate function returns rates and changes"
-            " nothing."
-        )
+        raise UnknownName(f"{self._label}.{name} can only be read: {self._why}.")
 
     def __delattr__(self, name: str) -> None:
         raise UnknownName(f"{self._label}.{name} can only be read.")

@@ -66,9 +66,6 @@ class StartCells:
         """Print what a user should know of the cells that a run starts from."""
         if cells is None:
             return
-        last, many = cells.colonies - 1, model.batch.colonies
-        if cells.colony is not None and many > last + 1:
-            print(f"note: colonies from {last + 1} to {many - 1} stay empty: {self.start} has none")
         for note in (extra_columns_note(str(self.start), cells, model), overlaps_note(cells)):
             if note:
                 print(f"note: {note}")

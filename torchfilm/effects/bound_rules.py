@@ -19,10 +19,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.cell_types import kept_by_type, with_values_of_new_types
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.rule_values import RuleError, warn_of_mixing
-from torchfilm.rule_views import KNOWN_FIELDS, MEANS, CellsView, DivisionView
-from torchfilm.state import Births, Field, State
+from torchfilm.rule_views import KNOWN_FIELDS, CellsView, DivisionView
+from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import HotReload
 from torchfilm.tools.warn_once import warn
@@ -64,7 +65,7 @@ class RulesReport:
         return self.words[place]
 
 
-class _BoundRule(BoundEffect):
+class BoundRule(BoundEffect):
     """A function of the user, which may be edited during a run: what it reads and writes, and what
     the other effects of the scene allow it to write."""
 
@@ -79,7 +80,8 @@ class _BoundRule(BoundEffect):
         # what a NaN means in the user's own variables, only the user knows
         self.shared = {n for n, title in binding.declared.items() if title != effect.title}
         self.types: dict[str, tuple[int, ...]] = {}
-        self.species: set[str] = set()
+        self.least_zero: set[str] = set()
+        self.by_type: tuple[str, ...] = ()
 
     def writes(self) -> tuple[str, ...]:
         return self.traced_writes
@@ -87,7 +89,8 @@ class _BoundRule(BoundEffect):
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         self.others = effects
         self.types = {n: t for e in effects for n, t in e.typed_values().items()}
-        self.species = {n for e in effects for n in getattr(e.effect, "species", ())}
+        self.least_zero = {n for e in effects for n in e.effect.at_least_zero()}
+        self.by_type = kept_by_type(effects)
 
     def _check_written(self, read: Collection[str], written: Collection[str]) -> None:
         """Raise InputError, or warn, as at binding, where the function writes what it did not write
@@ -105,6 +108,14 @@ class _BoundRule(BoundEffect):
         except Exception:
             self.traced_reads, self.traced_writes = before  # of the function that stays in use
             raise
+
+    def given(self, state: State, changed: Mapping[str, Tensor]) -> State:
+        """The state with what the rule gives. A cell that gets another type gets the values of that
+        type, but those that the rule gives."""
+        after = state.with_fields(**changed)
+        if "cell_type" not in changed:
+            return after
+        return with_values_of_new_types(state, after, [n for n in self.by_type if n not in changed])
 
     # --- values --------------------------------------------------------------------------
 
@@ -142,7 +153,7 @@ class _BoundRule(BoundEffect):
 
     def _unusable(self, name: str, value: Tensor) -> Tensor | None:
         """Which of these values (M, …) no effect can use, (M,) bool; None: all may be used."""
-        if name == "growth_rate" or name in self.species:
+        if name in self.least_zero:
             return ~(value >= 0)
         if name == "drag":
             return ~(value > 0)
@@ -165,7 +176,7 @@ class _BoundRule(BoundEffect):
         allowed = {
             "growth_rate": "at least 0. To let cells vanish, set remove_flag",
             "drag": "above 0",
-        }.get(name, "at least 0" if name in self.species and value < 0 else "a number")
+        }.get(name, "at least 0" if name in self.least_zero and value < 0 else "a number")
         shown = f"{float(value):g}" if value.dim() == 0 else value.tolist()
         return f"was set to {shown}: it must be {allowed}"
 
@@ -180,14 +191,14 @@ def _of_rows(found: Tensor) -> Tensor:
     return found if found.dim() == 1 else found.flatten(1).any(1)
 
 
-def _reported(state: State) -> Tensor:
+def reported(state: State) -> Tensor:
     """Which cells are in a colony that a rule has failed in this step, (N,) bool."""
     reports = [r for r in state.reports.values() if isinstance(r, RulesReport)]
     failed = torch.stack([r.status for r in reports]).amax(0) > 0
     return failed.index_select(0, state.colony)
 
 
-class BoundRules(_BoundRule):
+class BoundRules(BoundRule):
     """`update` after its trial: what it reads and writes, and the variables that it adds."""
 
     def __init__(self, effect: Rules, binding: Binding, source: HotReload):
@@ -218,10 +229,10 @@ class BoundRules(_BoundRule):
         twice = state.cells == 1 and "divide_flag" in state.fields
         both = torch.zeros(2, dtype=torch.int64, device=state.device)
         tried = state.take(both) if twice else state
-        view = CellsView(tried, TRIAL_STEP, _label(update), declaring=True)
+        view = CellsView(tried, TRIAL_STEP, label_of(update), declaring=True)
         try:
-            with _own_draws(_label(update)):
-                _act(update, view)
+            with own_draws(label_of(update)):
+                act(update, view)
         except RuleError as error:
             if not twice or "shape" not in str(error):
                 raise
@@ -235,7 +246,7 @@ class BoundRules(_BoundRule):
         self.traced_reads = tuple(sorted(view._read))
         self.traced_writes = tuple(_written(view, tried))
         state = self.ready(state)
-        warn_of_mixing(_label(update), partial(_columns, update), state)
+        warn_of_mixing(label_of(update), partial(_columns, update), state)
         return state
 
     def step(self, state: State, dt: float) -> State:
@@ -245,8 +256,8 @@ class BoundRules(_BoundRule):
         return self.source.call("update", partial(self._apply, state, dt), state)
 
     def _apply(self, state: State, dt: float, update: Callable[[CellsView], None]) -> State:
-        view = CellsView(state, dt, _label(update))
-        _act(update, view)
+        view = CellsView(state, dt, label_of(update))
+        act(update, view)
         work = dict(view._work)
         gone = work.pop("remove_flag", None)
         for name in work:
@@ -262,17 +273,17 @@ class BoundRules(_BoundRule):
         self._check_written(view._read, written)
         seen = self._with_report(state, None, work)
         if seen is not state:
-            state, kept = seen, _reported(seen)
-            work = {n: _where(kept, state.fields[n], v) for n, v in work.items()}
+            state, kept = seen, reported(seen)
+            work = {n: where(kept, state.fields[n], v) for n, v in work.items()}
             gone = None if gone is None else gone & ~kept
-        state = state.with_fields(**work)
+        state = self.given(state, work)
         return state if gone is None else state.remove(gone, "removed")
 
 
 def _columns(update: Callable[[CellsView], None], state: State) -> dict[str, Tensor]:
     """What a rule writes in a trial."""
-    view = CellsView(state, TRIAL_STEP, _label(update), declaring=True)
-    _act(update, view)
+    view = CellsView(state, TRIAL_STEP, label_of(update), declaring=True)
+    act(update, view)
     return dict(view._work)
 
 
@@ -291,7 +302,7 @@ def _effects(written: Collection[str]) -> list[str]:
     return ["cells" if n == "remove_flag" else n for n in sorted(written)]
 
 
-def _where(mask: Tensor, one: Tensor, other: Tensor) -> Tensor:
+def where(mask: Tensor, one: Tensor, other: Tensor) -> Tensor:
     """As torch.where, for rows (N, …) by a mask (N,)."""
     return torch.where(mask.reshape(-1, *[1] * (one.dim() - 1)), one, other)
 
@@ -302,69 +313,7 @@ def _variable(name: str, value: Tensor) -> Field:
     return known or Field(name, MEANING, dtype=value.dtype, shape=tuple(value.shape[1:]))
 
 
-class DivisionRule(_BoundRule):
-    """The part of Rules after division: the user's `divide(parent, daughter1, daughter2)`."""
-
-    def __init__(self, effect: Rules, binding: Binding, source: HotReload):
-        super().__init__(effect, binding, source)
-        self.stage, self.title = binding.division_stage + 1, "rules at division"
-
-    def declares(self) -> list[Field]:
-        return []
-
-    def reads(self) -> tuple[str, ...]:
-        return ("cells", *self.traced_reads)
-
-    def trace(self, state: State) -> State:
-        """Calls `divide` on a first cell and two copies of it, and notes its reads and writes."""
-        divide = self.source.functions["divide"]
-        if divide is None or not state.cells:
-            return state
-        one = torch.zeros(1, dtype=torch.int64, device=state.device)
-        twice = state.take(torch.cat([one, one]))
-        births = Births(one, one + 1, torch.cat([one, one]), state, one)
-        views = _after_divide(divide, twice, births)
-        self.traced_reads = tuple(sorted(_read(views)))
-        self.traced_writes = tuple(sorted(_written_in_daughters(views, in_place=True)))
-        return state
-
-    def step(self, state: State, dt: float) -> State:
-        for births in state.births:
-            act = partial(self._divide, state=state, births=births)
-            state = self.source.call("divide", act, state)
-        return state
-
-    def _divide(self, act: Callable[..., None], state: State, births: Births) -> State:
-        views = _after_divide(act, state, births)
-        daughters = views[1:]
-        # as in `_apply`, what is changed in place is compared only after an edit
-        written = _written_in_daughters(views, in_place=not self.source.proven)
-        self._check_written(_read(views), written)
-        old, seen = state.fields, state
-        changed: dict[str, Tensor] = {}
-        for daughter, rows in zip(daughters, (births.first, births.second), strict=True):
-            given = {n: v for n, v in daughter._work.items() if daughter._writable(n)}
-            seen = self._with_report(seen, rows, given)
-            for name, value in given.items():
-                changed[name] = changed.get(name, old[name]).index_copy(0, rows, value)
-        if seen is not state:
-            kept = _reported(seen)
-            changed = {n: _where(kept, old[n], v) for n, v in changed.items()}
-        return seen.with_fields(**changed)
-
-    def numerics(self, dt: float, state: State) -> list[str]:
-        return ["your own Python, once for all divisions of a step"]
-
-
-def _written_in_daughters(views: Sequence[DivisionView], in_place: bool) -> set[str]:
-    """What a rule wrote in the daughters, by setting it or, if asked, in place."""
-    written: set[str] = set()
-    for daughter in views[1:]:
-        written |= daughter._set | (daughter.changed_in_place() if in_place else set())
-    return written
-
-
-def _label(rule: Callable[..., None]) -> str:
+def label_of(rule: Callable[..., None]) -> str:
     """A label that gives each rule its own random numbers."""
     return (
         f"rule {getattr(rule, '__module__', '')}"
@@ -373,7 +322,7 @@ def _label(rule: Callable[..., None]) -> str:
 
 
 @contextmanager
-def _own_draws(label: str) -> Iterator[None]:
+def own_draws(label: str) -> Iterator[None]:
     """Warn of a rule that draws from generators which no seed of a run sets."""
     states = lambda: (torch.get_rng_state().tolist(), str(np.random.get_state()), random.getstate())  # noqa: NPY002
     before = states()
@@ -381,12 +330,12 @@ def _own_draws(label: str) -> Iterator[None]:
     if states() != before:
         warn(
             f"{label} draws random numbers with torch, numpy or random: another run with the same"
-            " seed has other numbers. Use cells.random(), which has a number for each cell, keyed"
-            " by seed, colony, cell and step."
+            " seed has other numbers. Use cells.random(), cells.chance(p) or"
+            " cells.binomial(n, p), which are keyed by seed, colony, cell and step."
         )
 
 
-def _act(rule: Callable[..., None], *views: CellsView | DivisionView) -> None:
+def act(rule: Callable[..., None], *views: CellsView | DivisionView) -> None:
     """Calls a rule on its views. Raises RuleError, with the line, if it uses a tensor as one
     number, or calls a function with what that does not take. Errors of other kinds are raised as
     they are."""
@@ -411,27 +360,9 @@ def _line_of(error: Exception, rule: Callable[..., None]) -> str:
         and not f.filename.startswith(PACKAGE)
     ]
     if not found:
-        return _label(rule)
+        return label_of(rule)
     return f"{Path(found[-1].filename).name}, line {found[-1].lineno} ({found[-1].line})"
 
 
 def _first_line(error: Exception) -> str:
     return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}".rstrip(": ")
-
-
-def _read(views: Sequence[DivisionView]) -> set[str]:
-    """The fields that a rule at division has read of parents and daughters."""
-    return {m for view in views for n in view._work for m in MEANS.get(n, (n,))}
-
-
-def _after_divide(
-    act: Callable[..., None], state: State, births: Births
-) -> tuple[DivisionView, DivisionView, DivisionView]:
-    """The views of parent, first and second daughter, after the rule."""
-    views = (
-        DivisionView(births.parents, None, "parent", "divide parent"),
-        DivisionView(state, births.first, "daughter1", "divide first"),
-        DivisionView(state, births.second, "daughter2", "divide second"),
-    )
-    _act(act, *views)
-    return views

@@ -346,6 +346,9 @@ class Circuit(Effect):
             f" shared=({name!r},))."
         )
 
+    def at_least_zero(self) -> tuple[str, ...]:
+        return self.own_fields
+
     def reads(self) -> tuple[str, ...]:
         typed = () if EVERY in self.rates else ("cell_type",)
         return (*self.variables.values(), self.volume_field, "length", "radius", *typed)

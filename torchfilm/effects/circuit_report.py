@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchfilm.circuits import failures, run
 from torchfilm.circuits.dilution import Start
-from torchfilm.effect import Concern
 from torchfilm.medium_exchange import Exchanged
+from torchfilm.reports import Concern
 from torchfilm.state import State
 from torchfilm.tools.threads import one_torch_thread
 

@@ -65,7 +65,8 @@ class Division(Effect):
 
     Give at most one threshold. length: centreline length, µm. volume: µm³. added: centreline grown
     since birth, µm (the adder). Each is a number, one per colony, one per cell type, or a
-    distribution drawn for each cell at birth. Cells divide at the end of the step in which they get
+    distribution drawn for each cell at birth. A cell that a rule gives another type gets that type's
+    threshold. Cells divide at the end of the step in which they get
     there, but in the next one where they are born beyond it; the flag also works beside a
     threshold. Without a threshold, only cells with `divide_flag` divide, right after the rules,
     before cells grow.
@@ -141,20 +142,13 @@ class Division(Effect):
             )
         return tuple(fields)
 
+    def keeps(self) -> Mapping[str, str]:
+        return dict.fromkeys(CRITERIA, "division_threshold")
+
     def reads(self) -> tuple[str, ...]:
-        more = {
-            "length": ("division_threshold",),
-            "volume": ("division_threshold",),
-            "added": ("division_threshold", "birth_length"),
-        }
-        return (
-            "divide_flag",
-            "length",
-            "radius",
-            "position",
-            "axis",
-            *more.get(self.criterion or "", ()),
-        )
+        threshold = ("division_threshold",) if self.criterion else ()
+        at_birth = ("birth_length",) if self.criterion == "added" else ()
+        return ("divide_flag", "length", "radius", "position", "axis", *threshold, *at_birth)
 
     def writes(self) -> tuple[str, ...]:
         return ("cells", "position", "axis", "length", "divide_flag")

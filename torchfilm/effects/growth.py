@@ -47,8 +47,8 @@ class Growth(Effect):
 
     rate: 1/h (µm/h with law "linear"): a number, one per colony, one per cell type, or a
     distribution drawn at birth. A rate by type follows the cell's type, and no rule may set
-    `growth_rate` then; where a type's rate is drawn, it is drawn when the cell is made and does not
-    follow a later change of type. None: cells grow at whatever rules or nutrition write to
+    `growth_rate` then; where a type's rate is drawn, a cell that a rule gives another type draws
+    that one's anew. None: cells grow at whatever rules or nutrition write to
     `growth_rate`, at first 0. law: "volume", dV/dt = rate·V, so that a cell's volume doubles in
     ln 2/rate, whatever its shape (the paper's wording); "length", dl/dt = rate·l of the centreline
     (the authors' program); "linear", dl/dt = rate. Exponentials are exact over a step.
@@ -91,6 +91,12 @@ class Growth(Effect):
                 "elongation", "growth wanted in this step, contained in length", "µm", internal=True
             ),
         )
+
+    def keeps(self) -> Mapping[str, str]:
+        return {"rate": "growth_rate"}
+
+    def at_least_zero(self) -> tuple[str, ...]:
+        return ("growth_rate",)
 
     def reads(self) -> tuple[str, ...]:
         return ("growth_rate", "length", "radius")

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfilm.effect import NUTRITION, Binding, BoundEffect, Effect
+from torchfilm.effect import GROWTH, NUTRITION, Binding, BoundEffect, Effect
 from torchfilm.medium_exchange import MediumExchange
 from torchfilm.resolver import Values
 from torchfilm.signals import uptake
@@ -54,8 +54,11 @@ class Monod(Effect):
 
     signal: name of the nutrient in the Medium. rate: greatest growth rate, 1/h. half: concentration
     of half that rate. growth_yield: µm³ of cell per unit of concentration × µm³ of nutrient. Each
-    is one number or one per colony. Monod sets `growth_rate`, so the scene's Growth must have no
-    rate of its own.
+    is a number, one per colony, one per cell type, or a distribution drawn at birth.
+
+    Monod sets `growth_rate`, so the scene's Growth must have no rate of its own, and no rule may
+    set it. What slows cells down, or stops them, goes into `factor`: the name of a variable of the
+    cells, such as rules set or circuits compute, that multiplies the rate of growth and uptake.
 
     Uptake and transport of the nutrient are solved together: also where a cell would empty the
     voxels about it many times in a step, diffusion feeds it. The medium loses exactly what the
@@ -68,6 +71,7 @@ class Monod(Effect):
     rate: Value = physical(1.0, unit="1/h", least=0.0)
     half: Value = physical(1.0, unit=CONCENTRATION, above=0.0)
     growth_yield: Value = physical(1.0, unit="1/conc", above=0.0)
+    factor: str | None = None
 
     stage = NUTRITION
     title = "nutrition"
@@ -86,8 +90,18 @@ class Monod(Effect):
     def reads(self) -> tuple[str, ...]:
         return ("position", "length", "radius", OUTSIDE + self.signal)
 
+    def __post_init__(self) -> None:
+        named = isinstance(self.factor, str) and self.factor.isidentifier()
+        if self.factor is not None and not named:
+            raise checks.input_error(
+                "Monod.factor", self.factor, "the name of a variable of the cells, or None"
+            )
+
     def needs(self) -> tuple[str, ...]:
-        return (OUTSIDE + self.signal, "growth_rate")
+        return (OUTSIDE + self.signal, "growth_rate", *self.at_least_zero())
+
+    def at_least_zero(self) -> tuple[str, ...]:
+        return () if self.factor is None else (self.factor,)
 
     def writes(self) -> tuple[str, ...]:
         return ("growth_rate", OUTSIDE + self.signal, f"{self.signal}_eaten")
@@ -157,6 +171,17 @@ class BoundMonod(BoundEffect):
         self.transport = transport
         return True
 
+    def check_others(self, effects: Sequence[BoundEffect]) -> None:
+        for other in effects:
+            between = NUTRITION <= other.stage <= GROWTH  # it may change what Monod has set
+            if other is not self and not between and "growth_rate" in other.writes():
+                raise checks.InputError(
+                    f"{other.title} sets growth_rate, which Monod sets again in every step. Let"
+                    " cells grow more slowly, or stop, by a variable that multiplies their rate of"
+                    " growth and uptake: tf.Rules(…, variables={'factor': 1.0}) and"
+                    " tf.Monod(…, factor='factor')."
+                )
+
     def step(self, state: State, dt: float) -> State:
         parts = self.transport.medium.steps
         for done in range(parts):
@@ -202,6 +227,8 @@ class BoundMonod(BoundEffect):
         rate, half, gain = (
             self.values[n].of_cells(state).double().expand_as(volume) for n in CONSTANTS
         )
+        if self.effect.factor is not None:
+            rate = rate * state.fields[self.effect.factor]
         outside = medium.in_reservoir
         fed = torch.ones_like(volume, dtype=torch.bool) if outside is None else ~outside
         return uptake.Eaters(

@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from torchfilm.effect import RULES, Binding, BoundEffect, Effect
-from torchfilm.effects.bound_rules import MEANING, BoundRules, DivisionRule
+from torchfilm.effects.bound_division_rule import DivisionRule
+from torchfilm.effects.bound_rules import MEANING, BoundRules
 from torchfilm.rule_views import OF_EFFECTS, CellsView, DivisionView
 from torchfilm.state import Field, State
 from torchfilm.tools import checks

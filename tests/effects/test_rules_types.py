@@ -1,0 +1,171 @@
+"""Cells that a rule gives another type have the values of that type; and what rules draw."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import torchfilm as tf
+
+ONE = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], cell_type=[0])
+EIGHT = tf.Cells(
+    [[6.0 * k, 0.0] for k in range(8)], [[1.0, 0.0]] * 8, length=3.9, cell_type=[0] * 8
+)
+
+
+def to_one(parent, daughter1, daughter2):
+    """The first daughters become of type 1."""
+    daughter1.cell_type = torch.ones_like(parent.cell_type)
+
+
+def divided(*effects: tf.Effect, founders: tf.Cells = EIGHT) -> tf.State:
+    scene = tf.Scene(*effects, tf.Mechanics(dim=2), founders=founders)
+    model = scene.bind()
+    return model.step(model.start(), 0.1)
+
+
+@pytest.mark.parametrize("inherited", [False, True])
+def test_drawn_growth_follows_a_type_given_at_birth(inherited):
+    law = lambda mean: tf.Uniform(mean, mean + 0.1, inherited=inherited)
+    state = divided(
+        tf.Rules(None, to_one), tf.Growth(rate={0: law(1.0), 1: law(2.0)}), tf.Division(length=4.0)
+    )
+    mutant = state.cell_type == 1
+    assert state.cells == 16 and int(mutant.sum()) == 8
+    rate = state.growth_rate
+    assert bool(((rate[mutant] >= 2.0) & (rate[mutant] <= 2.1)).all())
+    assert bool(((rate[~mutant] >= 1.0) & (rate[~mutant] <= 1.1)).all())
+    assert len(rate[mutant].unique()) == 8, "each mutant draws its own"
+
+
+@pytest.mark.parametrize("criterion", ["length", "added"])
+def test_a_threshold_by_type_follows_a_type_given_at_birth(criterion):
+    limits = {0: 4.0, 1: 6.0} if criterion == "length" else {0: 0.1, 1: 2.0}
+    state = divided(tf.Rules(None, to_one), tf.Growth(rate=1.0), tf.Division(**{criterion: limits}))
+    wanted = torch.tensor([limits[int(k)] for k in state.cell_type])
+    assert state.cells == 16 and torch.equal(state.division_threshold, wanted)
+
+
+def test_values_by_type_follow_a_type_given_in_a_step():
+    def older(cells):
+        cells.cell_type = 1 if cells.time >= 0.05 else cells.cell_type
+
+    def made(u, s, p, cell):
+        return {"gfp": p.make + 0.0 * u.gfp}
+
+    circuit = tf.Circuit(made, species="gfp", make={0: tf.Uniform(1.0, 2.0), 1: 5.0})
+    scene = tf.Scene(
+        tf.Rules(older), tf.Growth(rate=0.1), circuit, tf.Division(length={0: 4.0, 1: 6.0}),
+        tf.Mechanics(dim=2), founders=ONE,
+    )  # fmt: skip
+    model = scene.bind(3)
+    first = model.step(model.start(), 0.1)
+    assert first.division_threshold.tolist() == [4.0] * 3
+    assert bool((first.circuit_make < 2.0).all()) and len(first.circuit_make.unique()) == 3
+    second = model.step(first, 0.1)
+    assert second.cell_type.tolist() == [1] * 3
+    assert second.division_threshold.tolist() == [6.0] * 3
+    assert second.circuit_make.tolist() == [5.0] * 3
+    kept = second.with_fields(division_threshold=torch.full((3,), 7.0))
+    assert model.step(kept, 0.1).division_threshold.tolist() == [7.0] * 3, "no other change"
+
+
+def test_what_the_same_rule_sets_stands():
+    def mutate(parent, daughter1, daughter2):
+        daughter1.cell_type = torch.ones_like(parent.cell_type)
+        daughter1.growth_rate = torch.full_like(parent.growth_rate, 0.25)
+
+    state = divided(
+        tf.Rules(None, mutate),
+        tf.Growth(rate={0: tf.Uniform(1.0, 1.1), 1: tf.Uniform(2.0, 2.1)}),
+        tf.Division(length=4.0),
+    )
+    assert state.growth_rate[state.cell_type == 1].tolist() == [0.25] * 8
+
+
+# --- draws -------------------------------------------------------------------------------
+
+
+def test_chance_and_binomial_follow_their_laws():
+    seen = []
+
+    def draw(cells):
+        seen.append((cells.chance(0.3), cells.binomial(20, 0.25), cells.chance(0.3)))
+        cells.mark = seen[-1][1]
+
+    many = tf.Cells([[9.0 * k, 0.0] for k in range(4000)], [[0.0, 1.0]] * 4000)
+    model = tf.Scene(tf.Rules(draw, variables={"mark": 0.0}), dim=2, founders=many).bind()
+    seen.clear()
+    model.step(model.start(), 0.1)
+    chance, count, other = seen[-1]
+    assert chance.dtype == torch.bool and not torch.equal(chance, other)
+    # five standard errors
+    assert float(chance.double().mean()) == pytest.approx(0.3, abs=5 * (0.21 / 4000) ** 0.5)
+    assert float(count.mean()) == pytest.approx(5.0, abs=5 * (3.75 / 4000) ** 0.5)
+    assert float(count.var()) == pytest.approx(3.75, rel=0.2)
+    assert torch.equal(count, count.round()) and float(count.max()) <= 20
+
+
+def test_plasmids_go_to_one_daughter_or_the_other():
+    def part(parent, daughter1, daughter2):
+        k = parent.binomial(parent.plasmids, 0.5)
+        daughter1.plasmids, daughter2.plasmids = k, parent.plasmids - k
+
+    scene = tf.Scene(
+        tf.Rules(None, part, variables={"plasmids": 20.0}), tf.Growth(rate=1.0),
+        tf.Division(length=4.0), tf.Mechanics(dim=2),
+    )  # fmt: skip
+    *_, state = tf.simulate(scene, cells=16, colonies=3, seed=4)
+    *_, alone = tf.simulate(scene, cells=16, streams=[1], seed=4)
+    assert [float(state.plasmids[state.colony == c].sum()) for c in range(3)] == [20.0] * 3
+    assert len(state.plasmids.unique()) > 2
+    assert torch.equal(state.plasmids[state.colony == 1], alone.plasmids)
+
+
+@pytest.mark.parametrize(
+    ("rule", "words"),
+    [
+        (lambda c: c.chance(1.5), "the probability 1.5: it must be between 0 and 1"),
+        (lambda c: c.chance(float("nan")), "the probability nan"),
+        (lambda c: c.binomial(2.5, 0.5), "the number 2.5: it must be whole, 0 or more"),
+        (lambda c: c.binomial(3, torch.ones(7)), r"shape \(7,\): it must be one value, or \(1,\)"),
+        (lambda c: c.contacts(-1.0), r"contacts\(within\) = -1.0 is not allowed"),
+        (lambda c: c.lenght, "Did you mean 'length'?"),
+        (lambda c: setattr(c, "cell_type", 0.5), "cell_type takes whole numbers, and got 0.5.$"),
+    ],
+)
+def test_what_rules_ask_for_wrongly(rule, words):
+    with pytest.raises(tf.InputError, match=words):
+        tf.Scene(tf.Rules(rule), tf.Growth(rate=1.0), dim=2, founders=ONE).bind()
+
+
+def test_draws_of_torch_at_division_are_warned_of():
+    def part(parent, daughter1, daughter2):
+        daughter1.mark = torch.rand(len(parent.mark))
+
+    with pytest.warns(UserWarning, match="another run with the same seed has other numbers"):
+        tf.Scene(
+            tf.Rules(None, part, variables={"mark": 0.0}), tf.Growth(rate=1.0),
+            tf.Division(length=4.0), dim=2,
+        ).bind()  # fmt: skip
+
+
+def test_new_names_at_division_say_where_they_begin():
+    def named(name):
+        return lambda parent, one, two: setattr(one, name, 1)
+
+    for name, words in (
+        ("mark", r"give Rules\(…, variables=\{'mark': 0.0\}\)"),
+        ("cell_type", r"founders=tf.Cells\(…, cell_type=\[0\]\)"),
+    ):
+        with pytest.raises(tf.InputError, match=words):
+            tf.Scene(
+                tf.Rules(None, named(name)), tf.Growth(rate=1.0), tf.Division(length=4.0), dim=2
+            ).bind()
+
+
+def test_colonies_without_first_cells_are_warned_of():
+    two = tf.Cells([[0.0, 0.0]] * 2, [[1.0, 0.0]] * 2, colony=[0, 1])
+    scene = tf.Scene(tf.Growth(rate=1.0), dim=2, founders=two)
+    with pytest.warns(UserWarning, match="colonies 2, 3 of 4 stay empty"):
+        scene.bind(4)

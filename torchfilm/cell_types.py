@@ -1,0 +1,41 @@
+"""What cells of a type keep in fields of their own, and what becomes of it when a rule gives them
+another type."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import torch
+
+from torchfilm.effect import BoundEffect
+from torchfilm.state import State
+
+
+def kept_by_type(effects: Sequence[BoundEffect]) -> tuple[str, ...]:
+    """The fields in which cells keep a value that depends on their type, such as a threshold or
+    what was drawn for them at birth."""
+    found = []
+    for bound in effects:
+        own = bound.effect.keeps()
+        for name, value in vars(bound.values).items():
+            if value is None:
+                continue
+            by_type = value.types is not None or (value.draw is not None and value.draw.types)
+            field = value.field or own.get(name)
+            if by_type and field is not None:
+                found.append(field)
+    return tuple(dict.fromkeys(found))
+
+
+def with_values_of_new_types(before: State, after: State, names: Iterable[str]) -> State:
+    """`after`, with cells that were of another type in `before`, row by row, given the values of
+    their new type in these fields, drawn anew where they are drawn."""
+    names = [n for n in names if n in after.fields]
+    old, new = before.fields["cell_type"], after.fields["cell_type"]
+    if not names or new is old:
+        return after
+    rows = torch.nonzero(new != old).squeeze(1)
+    if not rows.numel():
+        return after
+    start = lambda n: after.declared[n].start(after, rows)
+    return after.with_fields(**{n: after.fields[n].index_copy(0, rows, start(n)) for n in names})

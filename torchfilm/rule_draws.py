@@ -1,0 +1,68 @@
+"""Random numbers for rules: keyed by seed, colony, cell and step, so that the same seed gives the
+same bits whatever the batch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchfilm.circuits.partition import binomial
+from torchfilm.rule_values import RuleError, as_tensor
+from torchfilm.state import State
+
+
+class Draws:
+    """What cells and divisions that rules see can draw. Each call gives new numbers."""
+
+    _state: State
+    _rows: Tensor | None
+    _draws: int
+    _purpose: str
+
+    def random(self) -> Tensor:
+        """A draw from (0, 1) for each cell, (N,), or each division, (M,), keyed by seed, colony,
+        cell and step. It does not depend on the batch."""
+        self.__dict__["_draws"] += 1
+        every = torch.arange(self._state.cells, device=self._state.device)
+        return self._state.uniform(
+            every if self._rows is None else self._rows, f"{self._purpose} {self._draws}"
+        )
+
+    def chance(self, probability: float | Tensor) -> Tensor:
+        """Whether something of this probability happens to each cell, (N,), or at each division,
+        (M,), bool. For a rate, 1/h, give 1 − exp(−rate · cells.dt)."""
+        drawn = self.random()
+        return drawn < _probability("chance", probability, drawn)
+
+    def binomial(self, number: float | Tensor, probability: float | Tensor) -> Tensor:
+        """How many of a `number` come out right, each with this probability: one draw for each
+        cell, (N,), or each division, (M,). Plasmids, say, that go to the first daughter:
+        k = parent.binomial(parent.plasmids, 0.5)."""
+        drawn = self.random()
+        count = _column("binomial", number, drawn)
+        if not bool((count >= 0).all()) or not bool((count == count.round()).all()):
+            wrong = count[~((count >= 0) & (count == count.round()))][0]
+            raise RuleError(f"binomial was given the number {wrong:g}: it must be whole, 0 or more")
+        return binomial(count, _probability("binomial", probability, drawn), drawn)
+
+
+def _column(what: str, value: Any, like: Tensor) -> Tensor:
+    given = as_tensor(what, value, like.device).detach().to(like.dtype)
+    if given.shape not in ((), like.shape):
+        raise RuleError(
+            f"{what} was given a tensor of shape {tuple(given.shape)}: it must be one value, or"
+            f" {tuple(like.shape)}."
+        )
+    return given.expand(like.shape)
+
+
+def _probability(what: str, value: Any, like: Tensor) -> Tensor:
+    given = _column(what, value, like)
+    wrong = ~((given >= 0) & (given <= 1))
+    if bool(wrong.any()):
+        raise RuleError(
+            f"{what} was given the probability {given[wrong][0]:g}: it must be between 0 and 1"
+        )
+    return given
