@@ -65,11 +65,10 @@ class Division(Effect):
 
     Give at most one threshold. length: centreline length, µm. volume: µm³. added: centreline grown
     since birth, µm (the adder). Each is a number, one per colony, one per cell type, or a
-    distribution drawn for each cell at birth. A cell that a rule gives another type gets that type's
-    threshold. Cells divide at the end of the step in which they get
-    there, but in the next one where they are born beyond it; the flag also works beside a
-    threshold. Without a threshold, only cells with `divide_flag` divide, right after the rules,
-    before cells grow.
+    distribution drawn for each cell at birth. A cell that a rule gives another type gets the
+    threshold of that type. Cells divide at the end of the step in which they get there, but in the
+    next one where they are born beyond it; the flag also works beside a threshold. Without a
+    threshold, only cells with `divide_flag` divide, right after the rules, before cells grow.
 
     fraction: share of the length that the first daughter (at the −axis end) gets; a distribution is
     drawn at each division. axis_noise: standard deviation of the noise on each component of a
