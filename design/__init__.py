@@ -16,6 +16,7 @@ from design.methods import CMAES, NSGA2, Batch, Bayesian, Local, Method, Polish,
 from design.objective import Evaluation, Objective
 from design.parameters import Choice, Parameter, Space
 from design.posterior import Posterior
+from design.prediction import Prediction
 from design.robustness import Robustness
 from design.robustness_check import check_robustness
 from design.saved_design import SavedDesign, load_design
@@ -75,6 +76,7 @@ __all__ = [
     "Parameter",
     "Polish",
     "Posterior",
+    "Prediction",
     "ProfileTarget",
     "Racing",
     "Ring",

@@ -22,6 +22,10 @@ EDGE = 1e-6  # coordinates this close to a bound count as so close
 FARTHEST = 10.0  # standard deviations: statistics farther off count as so far
 CONSTANT = 1e-9  # a standard deviation, relative to the mean, from which a statistic varies
 SAMPLES_AT_ONCE = 2**16
+# A flow that gives the truths of all simulations this much less density, in the logarithm, than
+# another one or than a straight line through them, has ended in a poor optimum. It is learnt again
+# so often.
+POOR, AGAIN = 1.0, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +57,10 @@ class NeuralPosterior:
         The method is that of Papamakarios and Murray (NeurIPS 2016) with masked autoregressive
         flows, by the package sbi; the mean of several flows is less sure of itself than each
         (Hermans et al., TMLR 2022). epochs: passes through the data at most; learning ends before,
-        20 passes after the loss on a tenth of the data has ceased to fall. begun: called with the
-        number of each flow, from 0, before it is learnt. Needs sbi (the `infer` extra). The state
-        of torch's random numbers is kept.
+        20 passes after the loss on a tenth of the data has ceased to fall. One flow in ten ends in
+        a poor optimum, as wide as the bounds; it is learnt again, and left out if it stays so. It
+        warns where all are poor. begun: called with the number of each flow, from 0, before it is
+        learnt. Needs sbi (the `infer` extra). The state of torch's random numbers is kept.
         """
         require_sbi()
         spread, level = statistics.std(0), np.abs(statistics).max(0)
@@ -69,11 +74,9 @@ class NeuralPosterior:
         learner = NeuralPosterior((), centre, scale, used)
         theta, x = _logit(torch.as_tensor(points)).float(), learner._inputs(statistics)
         with torch.random.fork_rng(devices=[]):
-            found = []
-            for k in range(flows):
-                begun(k)
-                found.append(_learn_flow(theta, x, seed + k, epochs))
-        return NeuralPosterior(tuple(found), centre, scale, used)
+            return NeuralPosterior(
+                _learn_flows(theta, x, seed, flows, epochs, begun), centre, scale, used
+            )
 
     def _inputs(self, statistics: np.ndarray) -> Tensor:
         found = (torch.as_tensor(statistics[:, self.used]) - self.centre) / self.scale
@@ -145,6 +148,41 @@ def _learn_flow(theta: Tensor, x: Tensor, seed: int, epochs: int) -> Any:
         learner.append_simulations(theta, x)
         batch = min(200, max(2, len(theta) // 10))
         return learner.train(training_batch_size=batch, max_num_epochs=epochs).eval()
+
+
+def _learn_flows(
+    theta: Tensor, x: Tensor, seed: int, flows: int, epochs: int, begun: Callable[[int], None]
+) -> tuple[Any, ...]:
+    """As many flows, without those in poor optima; at least one."""
+    line = _line_fit(theta, x)
+    found: list[tuple[float, Any]] = [(-math.inf, None)] * flows
+    for attempt in range(AGAIN + 1):
+        poor = max(line, *(fit for fit, _ in found)) - POOR
+        for k in range(flows):
+            if found[k][0] >= poor:
+                continue
+            begun(k)
+            made = _learn_flow(theta, x, seed + attempt * flows + k, epochs)
+            with torch.no_grad():
+                fit = float(made.log_prob(theta.unsqueeze(0), condition=x).double().mean())
+            found[k] = max(found[k], (fit, made), key=lambda one: one[0])
+    best = max(fit for fit, _ in found)
+    if best < line - POOR:
+        warnings.warn(
+            "The estimator has learnt less from the simulations than a straight line would, so that"
+            " the posterior is too wide. Give more simulations or epochs, or leave out statistics"
+            " (observed.without(…)).",
+            stacklevel=2,
+        )
+    return tuple(made for fit, made in found if fit >= best - POOR)
+
+
+def _line_fit(theta: Tensor, x: Tensor) -> float:
+    """The mean logarithm of the density of theta (n, D) by a linear regression on x (n, K)."""
+    given, wanted = torch.cat([torch.ones_like(x[:, :1]), x], 1).double(), theta.double()
+    left = wanted - given @ torch.linalg.lstsq(given, wanted, driver="gelsd").solution
+    spread = left.T @ left / len(left) + CONSTANT * torch.eye(left.shape[1], dtype=left.dtype)
+    return -0.5 * float(torch.logdet(2 * math.pi * math.e * spread))
 
 
 def _logit(u: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from design.calibration import Calibration
 from design.neural_posterior import NeuralPosterior
 from design.parameters import Parameter, Value, show_value
 from design.posterior_plot import draw_corner
+from design.prediction import Prediction
 from design.simulations import Simulations, random_points, shown_values, simulate_points
 from design.targets.observed import Observed
 from design.task import Task
@@ -20,6 +21,8 @@ from torchfilm import checks
 LEVEL = 0.9  # of intervals, unless a caller gives one
 BEYOND = 0.002  # share of simulations beyond a statistic for which the model is questioned
 STREAM = 2  # of the truths of a calibration
+PREDICTED = 3  # of predictions
+TOGETHER = 0.9  # a correlation from which the table tells of it
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -59,6 +62,15 @@ class Posterior:
                 observed.describe(),
                 f"data of the same statistics from {self.observed.colonies} colonies",
                 "Make it with like=….",
+            )
+        when = self.observed.time if self.task.until is None else self.task.until
+        now = observed.time
+        if when is not None and now is not None and abs(now - when) > 1e-6 * when:
+            raise checks.input_error(
+                "observed",
+                observed.describe(),
+                f"data of {when:g} h, since the posterior was learnt from colonies of that age",
+                "Call infer(…) for data of another time.",
             )
         return self.of(self.task, self.simulations, self.estimator, observed, len(self.points))
 
@@ -132,6 +144,11 @@ class Posterior:
             lines.append(line)
         lines.append(f"from {len(self.simulations)} simulations; {self.observed.describe()}")
         lines += [f"{n} simulations failed: {why}" for why, n in self.simulations.failures()[:3]]
+        lines += [
+            f"{one} and {other} are not told apart: their correlation is {r:.2f}"
+            for (one, other), r in self.correlations.items()
+            if abs(r) >= TOGETHER
+        ]
         if self.surprises:
             lines.append("The model does not reach the data within these bounds:")
             lines += [f"  {words}" for words in self.surprises]
@@ -172,6 +189,36 @@ class Posterior:
             samples=samples,
             failed=truths - len(kept),
         )
+
+    def predict(self, count: int = 100) -> Prediction:
+        """Grow colonies by `count` samples of the parameters, to compare with the observed ones:
+        whether the model can grow such colonies, and whether the posterior is as narrow as the data
+        allow. It costs `count` simulations. Raises InputError where all fail."""
+        checks.integer("count", count, least=2)
+        rows = np.random.default_rng([self.task.seed, PREDICTED]).integers(
+            len(self.points), size=count
+        )
+        # random numbers that no simulation, and no truth of a calibration, has used
+        found = simulate_points(self.task, self.points[rows], 2**24 + PREDICTED * 2**20)
+        sound = found.sound
+        if not sound.any():
+            raise tf.InputError(f"all {count} simulations failed: {found.failures()[0][0]}")
+        return Prediction(
+            self.observed, found.points[sound], found.statistics[sound], int((~sound).sum())
+        )
+
+    @property
+    def correlations(self) -> dict[tuple[str, str], float]:
+        """Of each two parameters, between the samples, on the scale of their bounds. Near 1 or −1
+        the data tell little of each, but much of one combination of both."""
+        numbers = [k for k, p in enumerate(self.task.space.parameters) if isinstance(p, Parameter)]
+        varied = [k for k in numbers if self.points[:, k].std() > 0]
+        found = {}
+        for place, k in enumerate(varied):
+            for other in varied[place + 1 :]:
+                r = np.corrcoef(self.points[:, k], self.points[:, other])[0, 1]
+                found[self.names[k], self.names[other]] = float(r)
+        return found
 
 
 def _most_frequent(values: np.ndarray) -> Value:

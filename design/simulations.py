@@ -162,8 +162,12 @@ def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.nda
         if isinstance(event, FailedColony):
             reasons[event.colony_id // each] = event.reason
             continue
-        values = observed.statistics(event.state, event.history)
-        found[event.state.colony_id.cpu().numpy()] = values.cpu().numpy()
+        ids = event.state.colony_id.cpu().numpy()
+        found[ids] = observed.statistics(event.state, event.history).cpu().numpy()
+        for colony_id, why in zip(ids.tolist(), observed.unfit(event.state), strict=True):
+            if why:  # it has stopped before the data were observed
+                found[colony_id] = np.nan
+                reasons[colony_id // each] = why
     means = found.reshape(len(item.rows), each, -1).mean(1)
     for k in np.flatnonzero(~np.isfinite(means).all(1)).tolist():
         reasons.setdefault(k, "a statistic is not finite")

@@ -34,6 +34,7 @@ FARTHEST = 100.0  # spreads: a statistic that is farther off counts as so far
 ENOUGH = 3  # colonies from which on the spread between them is measured
 FINEST = 0.01  # the least spread, relative to the greatest statistic of its group
 COUNT = 0.02  # the least spread of the logarithm of a number of cells
+VARIED = 0.01  # the least spread of a coefficient of variation
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,9 @@ class Observed(Target):
 
     The statistics are ln of the number of cells; the quantiles 10, 25, 50, 75 and 90 % of lengths
     and ages; the radius of gyration; cells per µm² in rings around the centre; the alignment of
-    neighbours, mean cos 2φ; and for each reporter its mean, its means in the rings, and Moran's I,
-    the correlation between neighbours. Neighbours are cells with centres closer than `reach`. All
-    are seen from above, in the x–y plane.
+    neighbours, mean cos 2φ; and for each reporter its mean, its means in the rings, Moran's I (the
+    correlation between neighbours) and its coefficient of variation between cells. Neighbours are
+    cells with centres closer than `reach`. All are seen from above, in the x–y plane.
 
     Loss: the mean over the statistics of ((statistic − value)/spread)². It is about 1 for a colony
     that grew as the observed ones did. It has no upper limit but 100², a statistic 100 spreads off.
@@ -410,6 +411,8 @@ def _observed(cells: SeenCells, plan: ColonyStatistics, time: float | None) -> O
     ])  # fmt: skip
     if plan.names[0] == LOG_CELLS:
         least[0] = COUNT
+    alike = torch.tensor([VARIED if n.endswith("_cv") else 0.0 for n in plan.names])
+    least = torch.maximum(least, alike.to(least))
     spread = torch.maximum(spread, least)
     spread = torch.where(spread > 0, spread, 1.0)  # a reporter that is dark in all cells
     total = int(cells.counts.sum())

@@ -85,6 +85,7 @@ class ColonyStatistics:
             if self.positions:
                 found[f"{name} profile"] = tuple(f"{name}_ring_{k}" for k in rings)
                 found[f"{name} neighbours"] = (f"{name}_neighbours",)
+            found[f"{name} variation"] = (f"{name}_cv",)
         return found
 
     @property
@@ -132,8 +133,8 @@ class ColonyStatistics:
     def _reporter(
         self, level: Tensor, cells: SeenCells, radius: Tensor | None, pairs: Tensor | None
     ) -> Tensor:
-        """Mean, means in rings and correlation between neighbours of one reporter, (B, …). An
-        empty ring counts as one with the mean of the colony."""
+        """Mean, means in rings, correlation between neighbours and coefficient of variation of one
+        reporter, (B, …). An empty ring counts as one with the mean of the colony."""
         mean = _means(level.unsqueeze(1), cells)
         scale = torch.where(mean != 0, mean, 1.0) if self.relative else torch.ones_like(mean)
         parts = [] if self.relative else [mean]
@@ -146,7 +147,7 @@ class ColonyStatistics:
             filled = count > 0
             profile = torch.where(filled, amount / torch.where(filled, count, 1.0), mean)
             parts += [profile / scale, _correlation(level, mean, cells, pairs)]
-        return torch.cat(parts, 1)
+        return torch.cat([*parts, _variation(level, mean, cells)], 1)
 
 
 def seen_cells(state: tf.State, plan: ColonyStatistics, history: Tensor | None) -> SeenCells:
@@ -295,6 +296,16 @@ def _over_pairs(value: Tensor, cells: SeenCells, pairs: Tensor) -> Tensor:
     both = torch.stack([value, torch.ones_like(value)], 1)
     out = value.new_zeros(len(cells.counts), 2).index_add(0, colony, both)
     return ratio(out[:, :1], out[:, 1:], 0.0)
+
+
+def _variation(level: Tensor, mean: Tensor, cells: SeenCells) -> Tensor:
+    """The standard deviation between the cells of a colony over their mean, (B, 1); 0 where all
+    cells are alike."""
+    apart = level - mean.squeeze(1).index_select(0, cells.colony)
+    variance = _means(apart.square().unsqueeze(1), cells)
+    varied = variance > STEADY * mean.square()
+    square = torch.where(varied, variance / torch.where(varied, mean.square(), 1.0), 1.0)
+    return torch.where(varied, square.sqrt(), 0.0)
 
 
 def _correlation(level: Tensor, mean: Tensor, cells: SeenCells, pairs: Tensor) -> Tensor:

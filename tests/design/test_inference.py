@@ -15,6 +15,7 @@ from searching import grown
 
 import torchfilm as tf
 from design import Calibration, Choice, Observed, Parameter, Task, infer, neural_posterior
+from design.neural_posterior import NeuralPosterior
 from design.parameters import Space
 from design.posterior_plot import draw_corner
 from design.simulations import simulate_designs, simulate_points
@@ -217,7 +218,7 @@ def test_choices_and_whole_numbers_are_inferred(tmp_path):
     data = Observed.from_state(state, species=["gfp"]).without("extent", "density", "alignment")
     found = infer(
         kinds, [Choice("kind", ("slow", "fast")), Parameter("copies", 1, 4, whole=True)], data,
-        simulations=200, flows=1, epochs=40, samples=200, progress=False,
+        simulations=600, flows=1, epochs=60, samples=200, progress=False,
     )  # fmt: skip
     assert found.mean == {"kind": "slow", "copies": 3}
     assert set(found.samples["kind"]) <= {"slow", "fast"} and "of the samples" in found.table()
@@ -261,3 +262,98 @@ def test_without_sbi_the_error_names_the_extra(monkeypatch, data):
     monkeypatch.setattr("design.neural_posterior.find_spec", lambda name: None)
     with pytest.raises(tf.InputError, match=r'pip install -e "\.\[infer\]"'):
         infer(colony, RATE, data)
+
+
+@needs_sbi
+def test_a_poor_flow_is_learnt_again(monkeypatch):
+    """A flow that ignores the statistics is as wide as the bounds."""
+    rng = np.random.default_rng(0)
+    points = rng.random((400, 1))
+    statistics = np.c_[points + 0.02 * rng.normal(size=(400, 1)), rng.normal(size=(400, 1))]
+    seeds, real = [], neural_posterior._learn_flow
+
+    def learn(theta, x, seed, epochs):
+        seeds.append(seed)
+        blind = seed in (1, 3)
+        return real(theta, torch.zeros_like(x) + 0.01 * torch.randn(x.shape) if blind else x, seed,
+                    epochs)  # fmt: skip
+
+    monkeypatch.setattr(neural_posterior, "_learn_flow", learn)
+    given = {"seed": 0, "epochs": 60}
+    found = NeuralPosterior.learn(points, statistics, flows=2, **given)
+    assert seeds == [0, 1, 3, 5] and len(found.flows) == 2
+    assert np.ptp(found.sample(statistics[:1], 500, seed=0)) < 0.4
+    seeds.clear()
+    alone = NeuralPosterior.learn(points, statistics, flows=1, **{**given, "seed": 1})
+    assert seeds == [1, 2] and np.ptp(alone.sample(statistics[:1], 500, seed=0)) < 0.4
+
+
+@needs_sbi
+def test_an_estimator_that_learns_nothing_is_warned_of(monkeypatch):
+    rng = np.random.default_rng(0)
+    points = rng.random((200, 1))
+    monkeypatch.setattr(neural_posterior, "_learn_flow", lambda theta, x, seed, epochs: _Flat())
+    with pytest.warns(UserWarning, match="learnt less from the simulations than a straight line"):
+        NeuralPosterior.learn(points, points + 0.001 * rng.random((200, 1)), seed=0, flows=2,
+                              epochs=5)  # fmt: skip
+
+
+class _Flat:
+    """A wide normal density, whatever the statistics."""
+
+    def log_prob(self, theta, condition):
+        return torch.distributions.Normal(0.0, 3.0).log_prob(theta).sum(-1)
+
+
+@needs_sbi
+def test_predictions_look_like_the_data_where_the_model_is_right(data):
+    found = infer(
+        colony, RATE, data, simulations=300, dt=0.1, flows=1, epochs=60, samples=300,
+        progress=False,
+    )  # fmt: skip
+    seen = found.predict(40)
+    assert seen.statistics.shape == (40, len(data.values)) and not seen.failed
+    assert set(seen.places) == set(data.plan.names)
+    low, high = seen.interval(0.99)["log_cells"]
+    assert low <= data.values[0] <= high
+    assert "outside; " in seen.table() and "loss of a simulation" in seen.table()
+    wrong = replace(data, values=(data.values[0] + 5.0, *data.values[1:]))
+    off = replace(seen, observed=wrong)
+    assert float(np.median(seen.losses)) < 0.5 * float(np.median(off.losses))
+    assert off.places["log_cells"] == 1.0 and "outside\n" in off.table() + "\n"
+    assert np.array_equal(seen.statistics, found.predict(40).statistics)
+
+
+@needs_sbi
+def test_data_of_another_time_are_refused(data):
+    found = infer(
+        colony, RATE, data, simulations=60, dt=0.1, flows=1, epochs=5, samples=20, progress=False
+    )
+    later = replace(data, time=data.time + 0.5)
+    with pytest.raises(tf.InputError, match=f"data of {data.time:g} h"):
+        found.given(later)
+    assert found.given(replace(data, time=None)).points.shape == found.points.shape
+
+
+@needs_sbi
+def test_colonies_that_stop_before_the_data_have_failed(data):
+    with pytest.raises(tf.InputError, match=r"it ended at .* h, and was observed at"):
+        infer(colony, RATE, data, simulations=60, dt=0.1, cells=2, progress=False)
+
+
+@needs_sbi
+def test_parameters_that_the_data_do_not_tell_apart_are_named(data):
+    def twice(first=1.0, second=1.0):
+        return colony(rate=first * second)
+
+    pair = [Parameter("first", 0.8, 1.25, log=True), Parameter("second", 0.8, 1.25, log=True)]
+    found = infer(
+        twice, pair, data, simulations=100, dt=0.1, flows=1, epochs=5, samples=50, progress=False
+    )
+    rng = np.random.default_rng(0)
+    one = rng.uniform(0.2, 0.8, 50)
+    tied = replace(found, points=np.c_[one, 1.0 - one + 0.01 * rng.normal(size=50)])
+    assert tied.correlations["first", "second"] < -0.95
+    assert "first and second are not told apart: their correlation is -" in tied.table()
+    loose = replace(found, points=rng.random((50, 2)))
+    assert "told apart" not in loose.table()

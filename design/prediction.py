@@ -1,0 +1,78 @@
+"""Whether colonies of a posterior look like the observed ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+import torchfilm as tf
+from design.targets.observed import Observed
+from torchfilm import checks
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Prediction:
+    """Statistics of colonies grown by parameters from a posterior, beside those that were observed:
+    a posterior predictive check (Gelman et al., Statistica Sinica 6, 733, 1996).
+
+    observed: the data. points: the parameters, (n, D) coordinates in [0, 1]. statistics: (n, K) by
+    `observed.plan.names`, means over as many colonies as were observed. failed: simulations that
+    failed, and are not among the n.
+    """
+
+    observed: Observed
+    points: np.ndarray
+    statistics: np.ndarray
+    failed: int = 0
+
+    @property
+    def losses(self) -> np.ndarray:
+        """Of each simulation the mean of ((statistic − value)/spread)², (n,). Where the model is
+        right and the posterior narrow, it is about 2, since data and simulation both scatter; it is
+        more where fewer than three colonies were observed, whose spread is underrated."""
+        apart = (self.statistics - np.array(self.observed.values)) / np.array(self.observed.spread)
+        return np.square(apart).mean(1)
+
+    @property
+    def places(self) -> dict[str, float]:
+        """The share of simulations with less than was observed, by statistic; of those with as
+        much, half. Near 0 or 1 the model does not grow such colonies."""
+        value = np.array(self.observed.values)
+        below, same = self.statistics < value, self.statistics == value
+        share = (below + 0.5 * same).mean(0)
+        return dict(zip(self.observed.plan.names, share.tolist(), strict=True))
+
+    def interval(self, level: float = 0.9) -> dict[str, tuple[float, float]]:
+        """The central interval of each statistic among the simulations."""
+        checks.number("level", level, above=0.0, most=1.0)
+        ends = np.quantile(self.statistics, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+        names = self.observed.plan.names
+        return {n: (float(a), float(b)) for n, a, b in zip(names, *ends, strict=True)}
+
+    def table(self, level: float = 0.9) -> str:
+        """Each statistic as observed and as predicted, those outside marked."""
+        lines = [
+            f"{'':<26} {'observed':>19}  {100 * level:g} % of {len(self.statistics)} predicted"
+        ]
+        outside = 0
+        rows = zip(
+            self.interval(level).items(), self.observed.values, self.observed.spread, strict=True
+        )
+        for (name, (low, high)), value, spread in rows:
+            out = not low <= value <= high
+            outside += out
+            line = f"{name:<26} {value:>10.4g} ± {spread:<6.2g}  {low:.4g} to {high:.4g}"
+            lines.append(line + ("  outside" if out else ""))
+        expected = (1 - level) * len(self.observed.values)
+        lines.append(f"{outside} outside; {expected:.1f} are to be expected")
+        lines.append(f"loss of a simulation, median: {np.median(self.losses):.3g}")
+        if self.failed:
+            lines.append(f"{self.failed} simulations failed and are left out")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return f"Prediction({len(self.statistics)} simulations of {len(self.places)} statistics)"
+
+    def _repr_html_(self) -> str:
+        return tf.displays.card("Prediction", tf.displays.text(self.table()))
