@@ -120,6 +120,11 @@ class Task(TaskOptions):
             raise checks.input_error(
                 "until", until, f"at least {seen:g} h, when the target was observed"
             )
+        for time in self.target.times:
+            if abs(round(time / dt) - time / dt) > 1e-6 * time / dt:
+                raise checks.input_error(
+                    "dt", dt, f"such that {time:g} h, when the target was observed, is a step"
+                )
         self._set(fixed=fixed, until=until, dt=dt, family=family, tried=tried)
 
     def _set(self, **values: Any) -> None:

@@ -5,6 +5,7 @@ from design.targets.goals import Burden, Constrained, Duration, Goals, Spread, W
 from design.targets.image import Image
 from design.targets.lasting import Lasting
 from design.targets.observed import Observed
+from design.targets.observed_course import ObservedCourse
 from design.targets.oscillation import Oscillation
 from design.targets.patterns import DomainSize, OnFraction
 from design.targets.profiles import Bands, Gradient, ProfileTarget, Ring
@@ -21,6 +22,7 @@ __all__ = [
     "Image",
     "Lasting",
     "Observed",
+    "ObservedCourse",
     "OnFraction",
     "Oscillation",
     "ProfileTarget",

@@ -46,6 +46,11 @@ class Target(metaclass=checks.KnownKeywords):
         """The species that the target reads, for pictures."""
         return ()
 
+    @property
+    def times(self) -> tuple[float, ...]:
+        """Times, h, at which it must see a colony after a step, beside the end."""
+        return ()
+
     def check(self, state: tf.State) -> None:
         """Raises `tf.InputError` where a first state lacks something that the target reads."""
 
