@@ -65,6 +65,7 @@ ROOMS = {
             "torchfilm.together",
             "torchfilm.binding_checks",
             "torchfilm.initial_cells",
+            "torchfilm.inocula",
             "torchfilm.micrographs",
         ),
     ),

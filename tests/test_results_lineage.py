@@ -164,3 +164,39 @@ def test_lineage_of_a_run_that_starts_in_the_middle_of_another(tmp_path):
     alive = [k for k, fate in zip(keys, found.fate, strict=True) if fate == "alive"]
     assert sorted(alive) == sorted(zip(last["colony"].tolist(), last["uid"].tolist(), strict=True))
     assert "nan" not in newick and newick.count(";") == len(begun)
+
+
+def test_founders_and_clones(tmp_path):
+    def cull(cells):
+        cells.remove_flag = (cells.uid == 2) | (cells.chance(0.02) & (cells.time > 0.5))
+
+    scene = tf.Scene(
+        tf.Rules(cull), tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.0, 4.0)), dim=2,
+        founders=tf.inoculum(4, radius=10.0, colonies=2),
+    )  # fmt: skip
+    path = tmp_path / "clones.h5"
+    *_, state = tf.simulate(scene, until=3.0, dt=0.05, record=path)
+    with tf.Results(path) as results:
+        tree = results.lineage()
+    for colony in (0, 1):
+        mine = state.uid[state.colony == colony].tolist()
+        roots = [([c, *tree.ancestors(c, colony)])[-1] for c in mine]
+        sizes = tree.clone_sizes(colony)
+        assert sizes == {f: roots.count(f) for f in range(4)} and sizes[2] == 0
+        assert sum(sizes.values()) == len(mine) > 10
+        one, other = mine[0], mine[-1]
+        lines = [[c, *tree.ancestors(c, colony)] for c in (one, other)]
+        shared = [c for c in lines[0] if c in lines[1]]
+        assert tree.common_ancestor([one, other], colony) == (shared[0] if shared else None)
+        assert tree.common_ancestor([one], colony) == one
+        daughters = [c for c in mine if tree.ancestors(c, colony)[:1] == lines[0][1:2]]
+        assert tree.common_ancestor(daughters, colony) in (one, lines[0][1])
+        text = tree.to_newick(colony, alive=True)
+        found = set(map(int, re.findall(rf"colony{colony}\.cell(\d+):", text)))
+        assert found == set(mine).union(*(tree.ancestors(c, colony) for c in mine))
+        assert text.count(";") == len(set(roots))
+        assert len(tree.to_newick(colony)) > len(text)
+    assert tree.to_pandas()["founder"].tolist() == tree.founder.tolist()
+    with pytest.raises(tf.InputError, match="one cell or more"):
+        tree.common_ancestor([], 0)
+    assert tree.common_ancestor([0, 1], 0) is None

@@ -17,6 +17,7 @@ from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
 from torchfilm.initial_cells import Cells
+from torchfilm.inocula import inoculum
 from torchfilm.loop import advance, failures
 from torchfilm.model import Model
 from torchfilm.physics.walls import Box, Channel, Plane, Sphere
@@ -115,6 +116,7 @@ __all__ = [
     "explain",
     "failures",
     "from_cellmodeller",
+    "inoculum",
     "keep_memory",
     "kinetics",
     "measure",

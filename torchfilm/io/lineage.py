@@ -3,6 +3,7 @@ ended."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,7 @@ class Lineage:
     colony: id of its colony · cell: its uid, unique within the colony · parent: uid, −1 for
     founders · born: h; the founders' is the start of the run, and that of cells which a run found
     in the middle of another is not known, NaN · ended: h, NaN while it lives · fate: "alive",
-    "divided", "removed", "left" or "failed".
+    "divided", "removed", "left" or "failed" · founder: uid of the first of its line in the file.
 
     Cells are named by uid, and in a run of several colonies by `colony`, an id, too. `course` reads
     the file, which must be open. Raises InputError for cells and colonies that the run does not
@@ -66,8 +67,9 @@ class Lineage:
         return f"Lineage({len(self)} cells in {colonies} colonies, {self.now:g} h)"
 
     def to_pandas(self) -> Any:
-        """A pandas.DataFrame with one row per cell: colony, cell, parent, born, ended, fate."""
-        names = ("colony", "cell", "parent", "born", "ended", "fate")
+        """A pandas.DataFrame with one row per cell: colony, cell, parent, founder, born, ended,
+        fate."""
+        names = ("colony", "cell", "parent", "founder", "born", "ended", "fate")
         return data_frame({name: getattr(self, name) for name in names})
 
     def born_of(self, colony: np.ndarray, cell: np.ndarray) -> np.ndarray:
@@ -91,6 +93,31 @@ class Lineage:
             found += generation
         return self.cell[found].tolist() if found else []
 
+    @cached_property
+    def founder(self) -> np.ndarray:
+        root = np.where(self._mothers < 0, np.arange(len(self)), self._mothers)
+        while not np.array_equal(above := root[root], root):  # twice as far up each time
+            root = above
+        return self.cell[root]
+
+    def clone_sizes(self, colony: int | None = None) -> dict[int, int]:
+        """How many living cells descend from each founder of a colony, by its uid; 0 for a line
+        that has died out."""
+        mine = self.colony == self.colony_of_run(colony)
+        alive = self.founder[mine & (self.fate == "alive")]
+        return {int(f): int((alive == f).sum()) for f in np.unique(self.founder[mine])}
+
+    def common_ancestor(self, cells: Sequence[int], colony: int | None = None) -> int | None:
+        """The youngest cell from which all of these descend, or that is one of them and the
+        ancestor of the others; None where they have different founders. The time at which their
+        lines part is its `ended`."""
+        given = [int(c) for c in np.asarray(cells).reshape(-1)]
+        if not given:
+            raise checks.input_error("cells", cells, "the numbers of one cell or more")
+        lines = [[cell, *self.ancestors(cell, colony)] for cell in given]
+        shared = set(lines[0]).intersection(*lines[1:])
+        return next((cell for cell in lines[0] if cell in shared), None)
+
     def course(self, cell: int, colony: int | None = None) -> dict[str, np.ndarray]:
         """The values of the cell and of its ancestors over time: the columns of `Results.table`,
         one row per frame since its founder."""
@@ -100,11 +127,26 @@ class Lineage:
         keep = lambda ids, uid: (ids == colony) & np.isin(uid, line)
         return tables(range(self.frames), keep)
 
-    def to_newick(self, colony: int | None = None) -> str:
+    def to_newick(self, colony: int | None = None, *, alive: bool = False) -> str:
         """The trees of one colony, or of all, in Newick format: a line for each founder. Nodes are
         named colony0.cell5; the length of a branch is how long the cell lived, h. A cell that was
-        there before the file counts from its first frame."""
-        return "".join(f"{self._newick(row)};\n" for row in self._roots(colony))
+        there before the file counts from its first frame. alive: only living cells and their
+        ancestors."""
+        checks.choice("alive", alive, (True, False))
+        kept = self._leading_to_life if alive else np.ones(len(self), bool)
+        roots = [row for row in self._roots(colony) if kept[row]]
+        return "".join(f"{self._newick(row, kept)};\n" for row in roots)
+
+    @cached_property
+    def _leading_to_life(self) -> np.ndarray:
+        """The cells that live, and their ancestors, (N,) bool."""
+        kept = self.fate == "alive"
+        new = np.flatnonzero(kept)
+        while new.size:
+            above = np.unique(self._mothers[new])
+            new = above[(above >= 0) & ~kept[above]]
+            kept[new] = True
+        return kept
 
     def to_networkx(self, colony: int | None = None) -> Any:
         """The trees of one colony, or of all, as a networkx.DiGraph from mother to daughter. Nodes
@@ -194,8 +236,9 @@ class Lineage:
     def _node(self, row: int) -> tuple[int, int]:
         return int(self.colony[row]), int(self.cell[row])
 
-    def _newick(self, root: int) -> str:
-        """The tree below a row, without recursion: a lineage may be thousands of cells deep."""
+    def _newick(self, root: int, kept: np.ndarray) -> str:
+        """The tree below a row, of `kept` cells (N,), without recursion: a lineage may be thousands
+        of cells deep."""
         born = np.where(np.isnan(self.born), self.begin, self.born)
         lived = np.where(np.isnan(self.ended), self.now, self.ended) - born
         text: list[str] = []
@@ -207,7 +250,7 @@ class Lineage:
                 continue
             colony, cell = self._node(item)
             stack.append(f"colony{colony}.cell{cell}:{lived[item]:.6g}")
-            if daughters := self._daughters.get(item):
+            if daughters := [d for d in self._daughters.get(item, ()) if kept[d]]:
                 stack.append(")")
                 for daughter in reversed(daughters):
                     stack += [daughter, ","]

@@ -1,0 +1,68 @@
+"""Founders at random places."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import torchfilm as tf
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_cells_are_scattered_evenly_and_none_overlap(dim):
+    cells = tf.inoculum(60, radius=20.0, colonies=10, dim=dim, seed=3)
+    distance = np.linalg.norm(cells.position, axis=1)
+    assert cells.overlaps() == [] and distance.max() <= 20.0
+    assert np.allclose(np.linalg.norm(cells.axis, axis=1), 1.0)
+    # evenly in the disc or ball: (r/R)^d is uniform; five standard errors of 600 numbers
+    share = (distance / 20.0) ** dim
+    assert share.mean() == pytest.approx(0.5, abs=5 / np.sqrt(12 * 600))
+    assert np.abs(cells.axis.mean(0)).max() < 5 / np.sqrt(dim * 600)
+
+
+def test_shares_of_types():
+    cells = tf.inoculum(31, radius=30.0, types={0: 0.9, 2: 0.1}, colonies=5, seed=1)
+    kinds = cells.cell_type.reshape(5, 31)
+    assert [(k == 2).sum() for k in kinds] == [3] * 5 and set(kinds.ravel()) == {0, 2}
+    assert len({tuple(k) for k in kinds}) == 5, "who is of which type is drawn"
+    assert np.bincount(tf.inoculum(3, 30.0, types={0: 0.5, 1: 0.5}).cell_type).sum() == 3
+
+
+def test_a_colony_is_the_same_among_others():
+    one = tf.inoculum(12, radius=12.0, types={0: 0.5, 1: 0.5}, seed=4)
+    many = tf.inoculum(12, radius=12.0, types={0: 0.5, 1: 0.5}, colonies=3, seed=4)
+    assert np.array_equal(one.position, many.position[:12]) and one.colony is None
+    assert np.array_equal(one.cell_type, many.cell_type[:12])
+    assert not np.array_equal(many.position[:12], many.position[12:24])
+    other = tf.inoculum(12, radius=12.0, seed=5)
+    assert not np.array_equal(one.position, other.position)
+
+
+def test_colonies_grow_from_it():
+    founders = tf.inoculum(5, radius=8.0, types={0: 0.4, 1: 0.6}, colonies=2)
+    scene = tf.Scene(
+        tf.Growth(rate={0: 1.0, 1: 1.2}), tf.Division(length=4.0), tf.Mechanics(dim=2),
+        founders=founders,
+    )  # fmt: skip
+    *_, state = tf.simulate(scene, cells=20)
+    assert state.colonies == 2 and int(state.counts.min()) >= 20
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"types": {0: 0.5, 1: 0.4}}, "sum to 1. Their sum is 0.9"),
+        ({"types": {0: 1.5}}, r"types\[0\] = 1.5"),
+        ({"types": {-1: 1.0}}, "types = -1"),
+        ({"types": [0, 1]}, "a share for each cell type"),
+        ({"radius": 2.0}, "30 cells of length 2 and radius 0.5 µm did not find room"),
+        ({"count": 0}, "count = 0"),
+        ({"dim": 4}, "dim = 4"),
+        ({"colonies": 0}, "colonies = 0"),
+        ({"length": -1.0}, "length = -1"),
+        ({"fractions": {0: 1.0}}, "no parameter 'fractions'"),
+    ],
+)
+def test_what_is_no_inoculum(given, words):
+    with pytest.raises(tf.InputError, match=words):
+        tf.inoculum(**{"count": 30, "radius": 15.0, **given})

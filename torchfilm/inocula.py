@@ -1,0 +1,121 @@
+"""Founders at random places: an inoculum of one strain, or of several."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+
+from torchfilm.initial_cells import Cells
+from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.tools import checks
+
+ROUNDS = 200  # in which cells that overlap are placed again
+
+
+@checks.known_keywords
+def inoculum(
+    count: int,
+    radius: float,
+    *,
+    types: Mapping[int, float] | None = None,
+    colonies: int = 1,
+    dim: int = 2,
+    length: float = 2.0,
+    cell_radius: float = 0.5,
+    seed: int = 0,
+) -> Cells:
+    """Founders at random places and in random directions, `count` in each of some colonies.
+
+        founders = tf.inoculum(30, radius=15.0, types={0: 0.9, 1: 0.1}, colonies=8)
+
+    radius: of the disc, in 3-D the ball, that contains their centres, µm. types: the share of each
+    cell type, which together are 1; each colony has these shares, as near as whole numbers of cells
+    come to them, and who is of which type is drawn. dim: 2 or 3. length: of the centreline, µm;
+    cell_radius: µm. No two cells overlap. Colony k is the same whatever the number of colonies.
+    Raises InputError for shares that do not sum to 1, and where the cells do not find room.
+    """
+    checks.integer("count", count, least=1)
+    checks.number("radius", radius, least=0.0)
+    checks.integer("colonies", colonies, least=1)
+    checks.choice("dim", dim, (2, 3))
+    checks.number("length", length, least=0.0)
+    checks.number("cell_radius", cell_radius, above=0.0)
+    checks.integer("seed", seed, least=0)
+    shares = _shares(types)
+    made = [
+        _colony(np.random.default_rng([seed, k]), count, radius, dim, length, cell_radius)
+        for k in range(colonies)
+    ]
+    kinds = [_types(np.random.default_rng([seed, k, 1]), count, shares) for k in range(colonies)]
+    return Cells(
+        np.concatenate([position for position, _ in made]),
+        np.concatenate([axis for _, axis in made]),
+        length,
+        cell_radius,
+        cell_type=None if shares is None else np.concatenate(kinds),
+        colony=None if colonies == 1 else np.repeat(np.arange(colonies), count),
+    )
+
+
+def _shares(types: object) -> dict[int, float] | None:
+    """The share of each type, checked."""
+    if types is None:
+        return None
+    if not isinstance(types, Mapping) or not types:
+        raise checks.input_error("types", types, "a share for each cell type, {0: 0.9, 1: 0.1}")
+    for kind, share in types.items():
+        checks.integer("types", kind, least=0)
+        checks.number(f"types[{kind}]", share, least=0.0, most=1.0)
+    total = float(sum(types.values()))
+    if abs(total - 1.0) > 1e-6:
+        raise checks.input_error(
+            "types", dict(types), "shares that sum to 1", f"Their sum is {total:g}."
+        )
+    return {int(k): float(v) for k, v in sorted(types.items())}
+
+
+def _types(rng: np.random.Generator, count: int, shares: dict[int, float] | None) -> np.ndarray:
+    """The type of each cell, (count,): whole numbers by the largest remainders, in random order."""
+    if shares is None:
+        return np.zeros(count, np.int64)
+    wanted = count * np.array(list(shares.values()))
+    numbers = np.floor(wanted + 1e-9).astype(int)
+    left = np.argsort(numbers - wanted, kind="stable")[: count - numbers.sum()]
+    numbers[left] += 1
+    return rng.permutation(np.repeat(list(shares), numbers))
+
+
+def _colony(
+    rng: np.random.Generator, count: int, radius: float, dim: int, length: float, cell_radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and axes of the cells of a colony, (count, dim) each."""
+    position, axis = np.empty((count, dim)), np.empty((count, dim))
+    again = np.arange(count)
+    for _ in range(ROUNDS):
+        way = rng.normal(size=(2, len(again), dim))
+        way /= np.linalg.norm(way, axis=2, keepdims=True)
+        position[again] = radius * rng.random((len(again), 1)) ** (1 / dim) * way[0]
+        axis[again] = way[1]
+        again = _overlapping(position, axis, length, cell_radius)
+        if not again.size:
+            return position, axis
+    raise checks.input_error(
+        "radius", radius, "wide enough for the cells",
+        f"{count} cells of length {length:g} and radius {cell_radius:g} µm did not find room in"
+        f" {ROUNDS} rounds: give a greater radius, or fewer cells.",
+    )  # fmt: skip
+
+
+def _overlapping(
+    position: np.ndarray, axis: np.ndarray, length: float, radius: float
+) -> np.ndarray:
+    """One cell of each pair that overlaps."""
+    count = len(position)
+    same = lambda x: torch.full((count,), x, dtype=torch.float64)
+    one = torch.zeros(count, dtype=torch.int64)
+    _, second, gap = gaps_nearby(
+        torch.from_numpy(position), torch.from_numpy(axis), same(length), same(radius), one, 1
+    )
+    return second[gap < 0].unique().numpy()
