@@ -66,6 +66,11 @@ def infer(
     """
     require_sbi()
     if not isinstance(observed, Observed):
+        if isinstance(observed, (list, tuple)):
+            raise tf.InputError(
+                "observed is one Observed, not a list: put data of several times together as"
+                " ObservedCourse([…])."
+            )
         raise checks.input_error(
             "observed", observed, "an Observed, such as Observed.from_table(…)"
         )

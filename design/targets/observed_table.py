@@ -57,13 +57,13 @@ def read_table(
         numbers = given.numbers(column)
         if name in ("length", "age"):
             _check_positive(given, column, numbers, name == "length" and length_with_caps)
-        found[name] = factor * torch.from_numpy(numbers)
+        found[name] = factor * torch.tensor(numbers)  # pandas may give what is read-only
     units.check_used(used)
     for name in species:
         column = columns.get(name, name)
         if column not in given.columns:
             raise given.missing(column)
-        found[name] = torch.from_numpy(given.numbers(column))
+        found[name] = torch.tensor(given.numbers(column))
     if ("x" in found) != ("y" in found):
         raise given.missing("y" if "x" in found else "x")
     if not found:

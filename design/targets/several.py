@@ -10,6 +10,7 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import Target
+from design.targets.observed import Observed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,9 +33,19 @@ class Several(Target):
     def failed(self) -> float:  # type: ignore[override]
         return sum(part.failed for part in self.parts)
 
+    @property
+    def times(self) -> tuple[float, ...]:
+        return tuple(sorted({time for part in self.parts for time in part.times}))
+
     def check(self, state: tf.State) -> None:
         for part in self.parts:
             part.check(state)
+        seen = sorted({p.time for p in self.parts if isinstance(p, Observed) and p.time})
+        if len(seen) > 1:
+            raise tf.InputError(
+                f"{type(self).__name__} has data of {', '.join(f'{t:g}' for t in seen)} h, and a"
+                " colony ends at one time: put them together as ObservedCourse([…])."
+            )
 
     def unfit(self, state: tf.State) -> list[str]:
         return [

@@ -12,7 +12,7 @@ import torch
 from searching import grown
 
 import torchfilm as tf
-from design import Objective, Observed, ObservedCourse, Parameter, Search, Task, infer
+from design import Objective, Observed, ObservedCourse, Parameter, Search, Task, Weighted, infer
 
 MAKE = [Parameter("make", 0.5, 2.0, log=True)]
 
@@ -157,3 +157,25 @@ def test_a_time_between_steps_is_refused(course):
     with pytest.raises(tf.InputError, match="without"):
         course.without("gfp_mean")
     assert math.isclose(course.time, 2.0)
+
+
+def test_frames_as_goals_or_in_a_list_are_refused(course):
+    one, other = course.frames
+    for target in (Weighted([(one, 1.0), (other, 1.0)]), Weighted([(one, 1.0), (course, 2.0)])):
+        with pytest.raises(tf.InputError, match=r"data of 1, 2 h.*ObservedCourse"):
+            Task(colony, MAKE, target, until=2.0, dt=0.1)
+    if find_spec("sbi") is not None:
+        with pytest.raises(tf.InputError, match=r"not a list.*ObservedCourse\(\[…\]\)"):
+            infer(colony, MAKE, [one, other], dt=0.1)
+
+
+def test_a_course_beside_another_goal(course):
+    goal = Weighted([(course, 1.0), (course.frames[1], 0.5)])
+    task = Task(colony, MAKE, goal, until=2.0, dt=0.1, replicates=2)
+    alone = Task(colony, MAKE, course, until=2.0, dt=0.1, replicates=2)
+    last = Task(colony, MAKE, course.frames[1], until=2.0, dt=0.1, replicates=2)
+    point = np.array([[0.3]])
+    found, first, second = (
+        float(Objective(t).evaluate(point).loss[0]) for t in (task, alone, last)
+    )
+    assert found == pytest.approx(first + 0.5 * second, rel=1e-9)
