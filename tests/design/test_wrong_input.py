@@ -185,3 +185,14 @@ def test_a_stripe_beyond_the_colonies_is_refused_again_where_the_search_is_resum
         with pytest.raises(tf.InputError, match="do not reach the pattern"):
             found.run(colonies=40, study=tmp_path / "stripe.h5")
         assert len(found.study.entries) == 1, "nothing more is grown"
+
+
+def test_warnings_of_a_scene_name_the_users_line():
+    def unread(make=1.0, decay=1.0):
+        circuit = tf.Circuit(lambda u, s, p, cell: {"gfp": p.make}, species="gfp", make=make,
+                             decay=decay)  # fmt: skip
+        return tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), circuit, dim=2)
+
+    with pytest.warns(UserWarning, match="a constant that no rate reads") as found:
+        Task(unread, [Parameter("make", 0.5, 2.0)], OnFraction("gfp", 0.5, 1.0), cells=4)
+    assert {w.filename for w in found} == {__file__}

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 # Modules between a user's line and a warning: torch runs steps again for a gradient.
-WITHIN = ("torchfilm", "torch", "contextlib")
+WITHIN = ("torchfilm", "design", "torch", "contextlib")
 # What has been said so far; None outside `once`. A context variable, so that threads do not silence
 # each other.
 _SAID: ContextVar[set[str] | None] = ContextVar("said", default=None)
