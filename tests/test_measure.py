@@ -134,7 +134,7 @@ def test_neighbours_within_no_such_gap_are_refused(gap):
     "name",
     [
         "overlaps", "colony_centre", "colony_radius", "depth", "nematic_order", "tilt",
-        "neighbours", "wall_forces", "growth_rates",
+        "neighbours", "wall_forces", "growth_rates", "strains", "heterozygosity",
     ],
 )  # fmt: skip
 def test_a_measure_of_no_state_is_refused(name):
@@ -223,3 +223,48 @@ def test_upright_cells_have_no_order_in_the_plane():
     order = lambda axes: float(tf.measure.nematic_order(made(axes).start()))
     assert math.isnan(order([[0.0, 0.0, 1.0]] * 2))
     assert order([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) == 1.0
+
+
+def labelled() -> tf.State:
+    """Two colonies of four and three cells, and an empty one; kinds 0, 0, 1, 4 and 1, 1, 1."""
+    cells = tf.Cells(
+        [[0.0, 1.0], [0.0, -1.0], [9.0, 0.0], [-9.0, 0.0], [0.0, 0.0], [3.0, 0.0], [-3.0, 0.0]],
+        [[1.0, 0.0]] * 7, cell_type=[0, 0, 1, 4, 1, 1, 1], colony=[0, 0, 0, 0, 1, 1, 1],
+        extra={"label": [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.5]},
+    )  # fmt: skip
+    scene = tf.Scene(tf.Growth(rate=1.0), dim=2, founders=cells)
+    with pytest.warns(UserWarning, match="stays empty"):
+        return scene.bind(3).start()
+
+
+def test_strains_and_heterozygosity():
+    state = labelled()
+    found = tf.measure.strains(state)
+    assert {k: v.tolist() for k, v in found.items()} == {
+        0: [2, 0, 0], 1: [1, 3, 0], 4: [1, 0, 0],
+    }  # fmt: skip
+    whole = tf.measure.heterozygosity(state).tolist()
+    assert whole[0] == pytest.approx(1 - (0.25 + 0.0625 + 0.0625)) and whole[1] == 0.0
+    assert math.isnan(whole[2])
+    rings = tf.measure.heterozygosity(state, edges=[0.0, 2.0, 5.0, 10.0])
+    assert rings[0, [0, 2]].tolist() == [0.0, 0.5] and bool(rings[0, 1].isnan())
+    assert rings[1, :2].tolist() == [0.0, 0.0] and bool(rings[2].isnan().all())
+    alone = tf.measure.heterozygosity(state.select([1]), edges=[0.0, 2.0, 5.0, 10.0])
+    assert torch.equal(alone[0, :2], rings[1, :2])
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"name": "label"}, "a field of one whole number for a cell"),
+        ({"name": "fitness"}, r"heterozygosity\(name\) = 'fitness'.*a field of the cells"),
+        ({"edges": [3.0]}, "two radii or more"),
+        ({"edges": [3.0, 3.0]}, "ascending"),
+    ],
+)
+def test_what_has_no_heterozygosity(given, words):
+    with pytest.raises(tf.InputError, match=words):
+        tf.measure.heterozygosity(labelled(), **given)
+    plain = tf.Scene(tf.Growth(rate=1.0), dim=2).bind().start()
+    with pytest.raises(tf.InputError, match="Give the first cells a type"):
+        tf.measure.strains(plain)

@@ -1,9 +1,10 @@
-"""Measures of a state: overlaps, forces on walls, radius, depth and alignment per colony, growth
-rates and neighbour pairs."""
+"""Measures of a state: overlaps, forces on walls, radius, depth, alignment and strains per colony,
+growth rates and neighbour pairs."""
 
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar, cast
@@ -15,7 +16,7 @@ from torchfilm.physics.contacts import gaps_nearby
 from torchfilm.physics.surfaces import FlatSurface
 from torchfilm.physics.wall_contacts import find_wall_contacts
 from torchfilm.physics.walls import Wall, depth_in_walls
-from torchfilm.state import State
+from torchfilm.state import CELL, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.threads import one_torch_thread
@@ -207,6 +208,62 @@ def tilt(state: State) -> Tensor:
     if state.dim == 2:
         return torch.zeros_like(state.length)
     return torch.asin(state.axis[:, 2].abs().clamp(max=1))
+
+
+@of_a_state
+@torch.no_grad()
+def strains(state: State, name: str = "cell_type") -> dict[int, Tensor]:
+    """How many cells of each kind a colony has: (B,) int64 by the values of a field of whole
+    numbers, such as the cell type or a neutral label that daughters inherit."""
+    kind = _kinds("strains", state, name)
+    count = lambda k: torch.bincount(state.colony[kind == k], minlength=state.colonies)
+    return {int(k): count(k) for k in kind.unique().tolist()}
+
+
+@of_a_state
+@torch.no_grad()
+def heterozygosity(
+    state: State, name: str = "cell_type", *, edges: Sequence[float] | None = None
+) -> Tensor:
+    """The probability that two cells drawn at random, with replacement, are of different kinds,
+    1 − Σ p², of each colony: (B,) float64. 0 where one kind is fixed; NaN without cells.
+
+    name: as for `strains`. edges: of rings around the colony's centre, µm, ascending, R + 1 of
+    them: then it is that of each ring, (B, R), NaN in a ring without cells, as in range expansions
+    (Hallatschek et al., PNAS 104, 19926, 2007)."""
+    kind = _kinds("heterozygosity", state, name)
+    rings, ring = 1, torch.zeros_like(state.colony)
+    if edges is not None:
+        limits = [checks.number("edges", e, least=0.0) for e in edges]
+        if len(limits) < 2 or any(b <= a for a, b in itertools.pairwise(limits)):
+            raise checks.input_error("edges", list(edges), "two radii or more, µm, ascending")
+        apart = state.position - colony_centre(state).index_select(0, state.colony)
+        radius = safe_norm(apart[:, :2].double().T)
+        rings = len(limits) - 1
+        ring = torch.bucketize(radius, radius.new_tensor(limits), right=True) - 1
+    inside = (ring >= 0) & (ring < rings)
+    place = (state.colony * rings + ring)[inside]
+    count = lambda x: torch.bincount(x, minlength=state.colonies * rings).double()
+    total, kept = count(place), kind[inside]
+    squares = torch.zeros_like(total)
+    for k in kept.unique().tolist():
+        squares += (count(place[kept == k]) / total) ** 2
+    found = torch.where(total > 0, 1.0 - squares, torch.nan).reshape(state.colonies, rings)
+    return found[:, 0] if edges is None else found
+
+
+def _kinds(measure: str, state: State, name: object) -> Tensor:
+    """A field of whole numbers of the cells, (N,) int64. Raises InputError for other fields."""
+    known = [n for n, f in state.declared.items() if f.scope == CELL and not f.internal]
+    if not isinstance(name, str) or name not in known:
+        hint = (
+            "" if name != "cell_type" else "Give the first cells a type: Cells(…, cell_type=[0])."
+        )
+        raise checks.input_error(f"{measure}(name)", name, f"a field of the cells: {known}", hint)
+    value = state.fields[name]
+    if value.dim() != 1 or not bool((value == value.round()).all()):
+        raise checks.input_error(f"{measure}(name)", name, "a field of one whole number for a cell")
+    return value.long()
 
 
 @of_a_state
