@@ -34,6 +34,7 @@ PATHS: Counter[str] = Counter()
     database=None,
     suppress_health_check=list(HealthCheck),
 )
+@pytest.mark.filterwarnings("ignore:.*empty. the cells are of")
 @given(fuzz.DRAWS)
 def test_random_scenes_obey_the_laws(draw):
     """Finite, nonnegative, unique uids, no escape, amounts conserved, the same alone as in the

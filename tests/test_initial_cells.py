@@ -57,6 +57,7 @@ def test_a_copy_for_each_colony():
     assert state.uid.tolist() == [0, 1] * 3 and state.next_uid.tolist() == [2, 2, 2]
 
 
+@pytest.mark.filterwarnings("ignore:.*empty. the cells are of")
 def test_a_colony_for_each_cell():
     cells = tf.Cells(
         [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]], [1.0, 0.0], colony=[2, 0, 2, 0]

@@ -269,6 +269,7 @@ def test_a_run_that_is_given_up_is_closed_and_complete(tmp_path):
         assert results.steps.tolist() == [0, 10, 13]
 
 
+@pytest.mark.filterwarnings("ignore:.*empty. the cells are of")
 def test_colonies_without_cells_are_recorded(tmp_path):
     cells = tf.Cells([[0.0, 0.0]], [1.0, 0.0], colony=[1])
 

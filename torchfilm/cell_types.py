@@ -29,13 +29,15 @@ def kept_by_type(effects: Sequence[BoundEffect]) -> tuple[str, ...]:
 
 def with_values_of_new_types(before: State, after: State, names: Iterable[str]) -> State:
     """`after`, with cells that were of another type in `before`, row by row, given the values of
-    their new type in these fields, drawn anew where they are drawn."""
-    names = [n for n in names if n in after.fields]
-    old, new = before.fields["cell_type"], after.fields["cell_type"]
-    if not names or new is old:
-        return after
-    rows = torch.nonzero(new != old).squeeze(1)
-    if not rows.numel():
-        return after
-    start = lambda n: after.declared[n].start(after, rows)
-    return after.with_fields(**{n: after.fields[n].index_copy(0, rows, start(n)) for n in names})
+    their new type in these fields, drawn anew where they are drawn; but for what has changed
+    itself."""
+    new_type = before.fields["cell_type"] != after.fields["cell_type"]
+    changed = {}
+    for name in names:
+        if name in after.fields:
+            value = after.fields[name]
+            rows = torch.nonzero(new_type & (value == before.fields[name])).squeeze(1)
+            if rows.numel():
+                first = after.declared[name].start(after, rows)
+                changed[name] = value.index_copy(0, rows, first)
+    return after.with_fields(**changed)

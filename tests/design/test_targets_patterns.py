@@ -116,6 +116,7 @@ def test_weakly_decided_stripes_are_as_wide_as_decided_ones(less):
     assert loss == pytest.approx(1 - z * z, rel=1e-6)
 
 
+@pytest.mark.filterwarnings("ignore:.*empty. the cells are of")
 def test_without_neighbours_there_is_no_domain():
     """Alone, far from all others, or next to a cell of another colony only."""
     state = placed(

@@ -82,6 +82,7 @@ def test_border_is_the_same_in_the_mirror():
     assert (border(state)[1].tolist(), border(mirrored)[1].tolist()) == ([0], [1])
 
 
+@pytest.mark.filterwarnings("ignore:.*empty. the cells are of")
 def test_there_is_no_border_without_two_types():
     """One type or no cell: NaN. A colony that has lost a type has loss 1."""
     state = placed(

@@ -100,6 +100,7 @@ def measures(target, state) -> dict[str, torch.Tensor]:
     return target.measures(state, None if note is None else note.unsqueeze(0))
 
 
+@pytest.mark.filterwarnings("ignore:.*empty. the cells are of")
 @pytest.mark.parametrize("case", UNDEFINED)
 def test_a_target_says_why_a_measure_is_undefined(case):
     target, state, measure, words = UNDEFINED[case]

@@ -83,6 +83,43 @@ def test_what_the_same_rule_sets_stands():
     assert state.growth_rate[state.cell_type == 1].tolist() == [0.25] * 8
 
 
+def test_what_a_rule_only_reads_is_not_set_by_it():
+    def mutate(cells):
+        cells.cell_type = torch.where(cells.growth_rate < 1.5, 1, cells.cell_type)
+        cells.seen = cells.growth_rate + cells.division_threshold
+
+    def one_by_one(cells):
+        for cell in cells:
+            if cell.growth_rate < 1.5 and cell.division_threshold < 5.0:
+                cell.cell_type = 1
+
+    for rule in (mutate, one_by_one):
+        scene = tf.Scene(
+            tf.Rules(rule, variables={"seen": 0.0}),
+            tf.Growth(rate={0: tf.Uniform(1.0, 1.1), 1: tf.Uniform(2.0, 2.1)}),
+            tf.Division(length={0: 4.0, 1: 8.0}), dim=2, founders=ONE,
+        )  # fmt: skip
+        model = scene.bind()
+        state = model.step(model.start(), 0.1)
+        assert state.cell_type.tolist() == [1] and state.division_threshold.tolist() == [8.0]
+        assert 2.0 <= float(state.growth_rate) <= 2.1
+
+
+def test_what_a_rule_sets_in_one_daughter_does_not_count_for_the_other():
+    def mutate(parent, daughter1, daughter2):
+        daughter1.growth_rate = torch.full_like(parent.growth_rate, 0.25)
+        daughter2.cell_type = torch.ones_like(parent.cell_type)
+
+    state = divided(
+        tf.Rules(None, mutate),
+        tf.Growth(rate={0: tf.Uniform(1.0, 1.1), 1: tf.Uniform(2.0, 2.1)}),
+        tf.Division(length=4.0),
+    )
+    mutant = state.cell_type == 1
+    assert state.growth_rate[~mutant].tolist() == [0.25] * 8
+    assert bool((state.growth_rate[mutant] >= 2.0).all())
+
+
 # --- draws -------------------------------------------------------------------------------
 
 

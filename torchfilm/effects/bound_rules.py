@@ -111,11 +111,11 @@ class BoundRule(BoundEffect):
 
     def given(self, state: State, changed: Mapping[str, Tensor]) -> State:
         """The state with what the rule gives. A cell that gets another type gets the values of that
-        type, but those that the rule gives."""
+        type, but where the rule changes them itself."""
         after = state.with_fields(**changed)
-        if "cell_type" not in changed:
+        if "cell_type" not in changed or not self.by_type:
             return after
-        return with_values_of_new_types(state, after, [n for n in self.by_type if n not in changed])
+        return with_values_of_new_types(state, after, self.by_type)
 
     # --- values --------------------------------------------------------------------------
 
