@@ -79,6 +79,7 @@ def infer(
         ("epochs", epochs, 1),
     ):  # fmt: skip
         checks.integer(name, value, least=least)
+    _check_end(observed.time, cells, until)
     kept = None if path is None else checks.file_path("path", path)
     task = Task(
         scene, parameters, observed, cells=cells,
@@ -90,6 +91,17 @@ def infer(
     with open_bar(flows, progress, "infer", counted="flows") as bar:
         estimator = _learn(found, seed, flows, epochs, bar)
     return Posterior.of(task, found, estimator, observed, samples)
+
+
+def _check_end(seen: float | None, cells: int | None, until: float | None) -> None:
+    """Raise InputError where colonies would not end when the data were `seen`, h."""
+    if seen is None:
+        return
+    rule = f"left out, since the data were observed at {seen:g} h"
+    if cells is not None:
+        raise checks.input_error("cells", cells, rule)
+    if until is not None and abs(until - seen) > 1e-6 * seen:
+        raise checks.input_error("until", until, rule)
 
 
 def _learn(found: Simulations, seed: int, flows: int, epochs: int, bar: Any) -> NeuralPosterior:

@@ -26,6 +26,7 @@ SAMPLES_AT_ONCE = 2**16
 # another one or than a straight line through them, has ended in a poor optimum. It is learnt again
 # so often.
 POOR, AGAIN = 1.0, 2
+ENOUGH = 5  # simulations for each statistic; a line through fewer fits them better than others
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +155,7 @@ def _learn_flows(
     theta: Tensor, x: Tensor, seed: int, flows: int, epochs: int, begun: Callable[[int], None]
 ) -> tuple[Any, ...]:
     """As many flows, without those in poor optima; at least one."""
-    line = _line_fit(theta, x)
+    line = _line_fit(theta, x) if len(x) >= ENOUGH * x.shape[1] else -math.inf
     found: list[tuple[float, Any]] = [(-math.inf, None)] * flows
     for attempt in range(AGAIN + 1):
         poor = max(line, *(fit for fit, _ in found)) - POOR
@@ -165,7 +166,8 @@ def _learn_flows(
             made = _learn_flow(theta, x, seed + attempt * flows + k, epochs)
             with torch.no_grad():
                 fit = float(made.log_prob(theta.unsqueeze(0), condition=x).double().mean())
-            found[k] = max(found[k], (fit, made), key=lambda one: one[0])
+            if found[k][1] is None or fit > found[k][0]:
+                found[k] = fit if math.isfinite(fit) else -math.inf, made
     best = max(fit for fit, _ in found)
     if best < line - POOR:
         warnings.warn(

@@ -17,7 +17,7 @@ class Prediction:
     a posterior predictive check (Gelman et al., Statistica Sinica 6, 733, 1996).
 
     observed: the data. points: the parameters, (n, D) coordinates in [0, 1]. statistics: (n, K) by
-    `observed.plan.names`, means over as many colonies as were observed. failed: simulations that
+    `observed.plan.names`, means over the replicates of the inference. failed: simulations that
     failed, and are not among the n.
     """
 
@@ -52,8 +52,9 @@ class Prediction:
 
     def table(self, level: float = 0.9) -> str:
         """Each statistic as observed and as predicted, those outside marked."""
+        width = max(26, *(len(n) for n in self.observed.plan.names))
         lines = [
-            f"{'':<26} {'observed':>19}  {100 * level:g} % of {len(self.statistics)} predicted"
+            f"{'':<{width}} {'observed':>19}  {100 * level:g} % of {len(self.statistics)} predicted"
         ]
         outside = 0
         rows = zip(
@@ -62,7 +63,7 @@ class Prediction:
         for (name, (low, high)), value, spread in rows:
             out = not low <= value <= high
             outside += out
-            line = f"{name:<26} {value:>10.4g} ± {spread:<6.2g}  {low:.4g} to {high:.4g}"
+            line = f"{name:<{width}} {value:>10.4g} ± {spread:<6.2g}  {low:.4g} to {high:.4g}"
             lines.append(line + ("  outside" if out else ""))
         expected = (1 - level) * len(self.observed.values)
         lines.append(f"{outside} outside; {expected:.1f} are to be expected")

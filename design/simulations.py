@@ -208,6 +208,8 @@ def _read(path: Path | None, task: Task) -> Simulations:
         kept, mine = json.loads(file.attrs["about"]), about(task)
         reasons = {int(k): words for k, words in json.loads(file.attrs["reasons"]).items()}
         found = Simulations(file["points"][...], file["statistics"][...], reasons)
+        kept["statistics"] = [n.decode() for n in file["names"][...]]
+    mine["statistics"] = list(names)
     plain = json.loads(json.dumps(mine))
     differing = [name for name in plain | kept if kept.get(name) != plain.get(name)]
     if differing:

@@ -115,7 +115,8 @@ class Task(TaskOptions):
         steps = 1.0 if until is None else until / dt
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
             raise checks.input_error("until", until, f"a whole number of steps of dt = {dt:g} h")
-        seen = self.target.time if isinstance(self.target, Observed) else None
+        own = self.target.time if isinstance(self.target, Observed) else None
+        seen = max(self.target.times, default=None) if own is None else own
         if seen is not None and until is not None and until < seen * (1 - 1e-9):
             raise checks.input_error(
                 "until", until, f"at least {seen:g} h, when the target was observed"

@@ -12,6 +12,8 @@ from torchfilm.circuits.partition import binomial
 from torchfilm.rule_values import RuleError, as_tensor
 from torchfilm.state import State
 
+BITS = 2.0**23  # of a uniform draw
+
 
 class Draws:
     """What cells and divisions that rules see can draw. Each call gives new numbers."""
@@ -34,7 +36,9 @@ class Draws:
         """Whether something of this probability happens to each cell, (N,), or at each division,
         (M,), bool. For a rate, 1/h, give 1 − exp(−rate · cells.dt)."""
         drawn = self.random()
-        return drawn < _probability("chance", probability, drawn)
+        # two draws of 23 bits, or the rarest events would never happen
+        fine = ((drawn.double() * BITS).floor() + self.random().double()) / BITS
+        return fine < _probability("chance", probability, fine)
 
     def binomial(self, number: float | Tensor, probability: float | Tensor) -> Tensor:
         """How many of a `number` come out right, each with this probability: one draw for each
@@ -42,9 +46,11 @@ class Draws:
         k = parent.binomial(parent.plasmids, 0.5)."""
         drawn = self.random()
         count = _column("binomial", number, drawn)
-        if not bool((count >= 0).all()) or not bool((count == count.round()).all()):
-            wrong = count[~((count >= 0) & (count == count.round()))][0]
-            raise RuleError(f"binomial was given the number {wrong:g}: it must be whole, 0 or more")
+        wrong = count[~((count >= 0) & (count == count.round()) & count.isfinite())]
+        if wrong.numel():
+            raise RuleError(
+                f"binomial was given the number {wrong[0]:g}: it must be whole, 0 or more"
+            )
         return binomial(count, _probability("binomial", probability, drawn), drawn)
 
 

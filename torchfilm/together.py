@@ -33,6 +33,7 @@ from torchfilm.tools.timing import Timings
 # where derivatives are wanted, as do those for the derivatives; they have failed if they do by
 # LOST of it. MOST: iterations; a few are usual.
 PART, FINE, LOST = 0.3, 1e-3, 10.0
+FINEST_FINE = 1e-9  # roundings of float32 in species do not let a solve come much closer
 MOST = 50
 # Parts of a step into which a colony may divide it. ROUNDED: see `profile`.
 FINEST = 16
@@ -239,7 +240,7 @@ class _Step:
     @property
     def fine(self) -> float:
         """Where it ends, and those for derivatives do, where these are wanted."""
-        return FINE * self.together.rtol
+        return max(FINE * self.together.rtol, FINEST_FINE)
 
 
 def profile(x: Tensor, dt: float, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:

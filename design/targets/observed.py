@@ -361,7 +361,7 @@ def _names(species: Sequence[str], like: Observed | None) -> tuple[str, ...]:
 
 
 def _check_like(like: object) -> None:
-    if not isinstance(like, Observed | None):
+    if not isinstance(getattr(like, "plan", like), ColonyStatistics | None):
         raise checks.input_error("Observed(like)", like, "another Observed, or None")
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.observed import Observed
+from design.targets.observed import FARTHEST, Observed
 from design.targets.statistics import LOG_CELLS, ColonyStatistics, birth_note
 from torchfilm import checks
 
@@ -124,6 +124,17 @@ class ObservedCourse(Observed):
         earlier = torch.where(seen, noted, 0.0).sum(0)
         earlier = torch.where(seen.any(0), earlier, math.nan)
         return torch.cat([earlier, self.frames[-1].statistics(state, history)], 1)
+
+    def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        """As of `Observed`; of the frames that were reached, in a colony that is grown for a part
+        of its time only, as a first look of `Racing`."""
+        found = self.statistics(state, history)
+        apart = (found - found.new_tensor(self.values)) / found.new_tensor(self.spread)
+        parts = apart.split([len(f.values) for f in self.frames], 1)
+        reached = [~x.isnan().all(1, keepdim=True) for x in parts]
+        kept = torch.cat([torch.where(r, x, 0.0) for r, x in zip(reached, parts, strict=True)], 1)
+        count = sum((r * x.shape[1] for r, x in zip(reached, parts, strict=True)), reached[0] * 0)
+        return kept.clamp(-FARTHEST, FARTHEST) / count.clamp(min=1).double().sqrt()
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:

@@ -336,9 +336,37 @@ def test_data_of_another_time_are_refused(data):
 
 
 @needs_sbi
+def test_an_end_other_than_that_of_the_data_is_refused(data):
+    for name, end in {"cells": 2, "until": data.time + 1.0}.items():
+        with pytest.raises(tf.InputError, match=f"{name} = {end:g}.* left out, since the data"):
+            infer(colony, RATE, data, dt=0.1, progress=False, **{name: end})
+
+
 def test_colonies_that_stop_before_the_data_have_failed(data):
-    with pytest.raises(tf.InputError, match=r"it ended at .* h, and was observed at"):
-        infer(colony, RATE, data, simulations=60, dt=0.1, cells=2, progress=False)
+    task = Task(colony, RATE, data, until=data.time, cells=3, replicates=2, dt=0.1, replay=False)
+    found = simulate_points(task, np.array([[0.9]]), 0)
+    assert not found.sound.any() and "and was observed at" in found.reasons[0]
+
+
+@needs_sbi
+def test_few_simulations_of_many_statistics_are_not_compared_with_a_line():
+    """A line through 60 points of 40 numbers fits them far better than others."""
+    rng = np.random.default_rng(1)
+    points = rng.random((60, 1))
+    statistics = np.c_[points, rng.normal(size=(60, 39))]
+    assert len(NeuralPosterior.learn(points, statistics, seed=0, flows=1, epochs=3).flows) == 1
+
+
+def test_a_file_of_other_statistics_is_refused(data, tmp_path):
+    task = task_of(data)
+    path = tmp_path / "simulations.h5"
+    simulate_designs(task, 2, path=path)
+    with h5py.File(path, "r+") as file:
+        names = file["names"][...]
+        del file["names"]
+        file.create_dataset("names", data=names[:-1])
+    with pytest.raises(tf.InputError, match="this one differs in statistics"):
+        simulate_designs(task, 2, path=path)
 
 
 @needs_sbi

@@ -179,3 +179,24 @@ def test_a_course_beside_another_goal(course):
         float(Objective(t).evaluate(point).loss[0]) for t in (task, alone, last)
     )
     assert found == pytest.approx(first + 0.5 * second, rel=1e-9)
+
+
+def test_a_first_look_scores_the_frames_that_it_reaches(course):
+    """Racing grows colonies for a part of the time."""
+    task = Task(colony, MAKE, course, until=2.0, dt=0.1, replicates=2)
+    looked = Objective(task).evaluate(np.array([[0.5], [1.0]]), size=0.6)
+    assert not looked.reasons and looked.loss[0] < looked.loss[1] < course.failed
+
+
+def test_a_course_is_no_model_for_another_table(course):
+    *_, state = tf.simulate(colony(), until=1.0, dt=0.1)
+    with pytest.raises(tf.InputError, match=r"Observed\(like\)"):
+        Observed.from_state(state, species=["gfp"], like=course)
+
+
+def test_times_count_within_goals(course):
+    odd = ObservedCourse([replace(course.frames[0], time=1.03), course.frames[1]])
+    with pytest.raises(tf.InputError, match="when the target was observed, is a step"):
+        Task(colony, MAKE, Weighted([(odd, 1.0)]), until=2.0, dt=0.1)
+    with pytest.raises(tf.InputError, match="at least 2 h, when the target was observed"):
+        Task(colony, MAKE, Weighted([(course, 1.0)]), until=1.0, dt=0.1)

@@ -361,3 +361,11 @@ def test_rules_that_set_the_rate_of_a_fed_cell_are_refused():
     )  # fmt: skip
     with pytest.raises(tf.SimulationError, match="vigour of cell 0 was set to -1: it must be at"):
         list(tf.simulate(scene, until=0.1))
+    for given, words in (({"vigour": -2.0}, "vigour of a first cell is below 0"), ({}, "factor")):
+        name = "vigour" if given else "length"
+        scene = tf.Scene(
+            tf.Rules(lambda c: None, variables=given), tf.Monod("food", factor=name), *fed[1:],
+            dim=2,
+        )  # fmt: skip
+        with pytest.raises(tf.InputError, match=words):
+            scene.bind()

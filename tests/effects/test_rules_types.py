@@ -206,3 +206,34 @@ def test_colonies_without_first_cells_are_warned_of():
     scene = tf.Scene(tf.Growth(rate=1.0), dim=2, founders=two)
     with pytest.warns(UserWarning, match="colonies 2, 3 of 4 stay empty"):
         scene.bind(4)
+
+
+def test_rare_events_happen():
+    """One in ten million cells: a uniform draw of 23 bits alone is never below 6e-8."""
+    from torchfilm.rule_draws import BITS, Draws
+
+    class Least(Draws):
+        """The first draw is the least one, the second one in the middle."""
+
+        def __init__(self, second):
+            self.given = iter([torch.tensor([0.5 / BITS]), torch.tensor([second])])
+
+        def random(self):
+            return next(self.given)
+
+    assert bool(Least(0.1).chance(5e-8)) and not bool(Least(0.9).chance(5e-8))
+
+
+def test_two_rules_draw_numbers_of_their_own():
+    def one(parent, daughter1, daughter2):
+        daughter1.x = daughter1.random()
+
+    def other(parent, daughter1, daughter2):
+        daughter1.y = daughter1.random()
+
+    state = divided(
+        tf.Rules(None, one, variables={"x": 0.0}), tf.Rules(None, other, variables={"y": 0.0}),
+        tf.Growth(rate=1.0), tf.Division(length=4.0),
+    )  # fmt: skip
+    drawn = state.x > 0
+    assert int(drawn.sum()) == 8 and not bool((state.x == state.y)[drawn].any())

@@ -91,10 +91,11 @@ def _after_divide(
     divide: Callable[..., None], state: State, births: Births
 ) -> tuple[DivisionView, DivisionView, DivisionView]:
     """The views of parent, first and second daughter, after the rule."""
+    label = label_of(divide)  # two rules draw numbers of their own
     views = (
-        DivisionView(births.parents, None, "parent", "divide parent"),
-        DivisionView(state, births.first, "daughter1", "divide first"),
-        DivisionView(state, births.second, "daughter2", "divide second"),
+        DivisionView(births.parents, None, "parent", f"{label} divide parent"),
+        DivisionView(state, births.first, "daughter1", f"{label} divide first"),
+        DivisionView(state, births.second, "daughter2", f"{label} divide second"),
     )
     act(divide, *views)
     return views

@@ -16,7 +16,7 @@ from torchfilm.medium_exchange import MediumExchange
 from torchfilm.resolver import Values
 from torchfilm.signals import uptake
 from torchfilm.signals.compiled_uptake import EVENTS
-from torchfilm.state import OUTSIDE, Field, State
+from torchfilm.state import CELL, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.doubling import check_doubling
 from torchfilm.values import CONCENTRATION, Value, is_drawn, numbers, physical
@@ -121,6 +121,16 @@ class Monod(Effect):
                 f"Monod sets growth of the volume, in 1/h, but Growth takes its rate in {unit!r}:"
                 " use Growth() with law='volume'."
             )
+        if self.factor is not None:
+            declared = state.declared.get(self.factor)
+            if declared is None or declared.scope != CELL or declared.shape:
+                raise checks.input_error(
+                    "Monod.factor", self.factor, "a variable with one number for each cell"
+                )
+            if bool((~(state.fields[self.factor] >= 0)).any()):
+                raise checks.InputError(
+                    f"Monod.factor: {self.factor} of a first cell is below 0; it must be 0 or more."
+                )
         if bool((state.growth_rate != 0).any()):
             raise checks.InputError(
                 "Monod sets the growth rate, but Growth has a rate of its own, which would be"
@@ -173,7 +183,11 @@ class BoundMonod(BoundEffect):
 
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         for other in effects:
-            between = NUTRITION <= other.stage <= GROWTH  # it may change what Monod has set
+            # it may change what Monod has set
+            between = (self.stage, self.place) < (
+                other.stage,
+                other.place,
+            ) and other.stage <= GROWTH
             if other is not self and not between and "growth_rate" in other.writes():
                 raise checks.InputError(
                     f"{other.title} sets growth_rate, which Monod sets again in every step. Let"
