@@ -175,9 +175,7 @@ class Posterior:
         checks.integer("truths", truths, least=2)
         checks.integer("samples", samples, least=9)
         points = random_points(self.task, truths, stream=STREAM)
-        # random numbers that no simulation has used
-        first = 2**24 + STREAM * 2**20
-        found = simulate_points(self.task, points, first)
+        found = simulate_points(self.task, points, _first(STREAM))
         kept = Simulations(points[found.sound], found.statistics[found.sound])
         drawn = self.estimator.sample(kept.statistics, samples, seed=self.task.seed + 1)
         here = self.estimator.log_density(kept.points[:, None], kept.statistics)
@@ -198,8 +196,7 @@ class Posterior:
         rows = np.random.default_rng([self.task.seed, PREDICTED]).integers(
             len(self.points), size=count
         )
-        # random numbers that no simulation, and no truth of a calibration, has used
-        found = simulate_points(self.task, self.points[rows], 2**24 + PREDICTED * 2**20)
+        found = simulate_points(self.task, self.points[rows], _first(PREDICTED))
         sound = found.sound
         if not sound.any():
             raise tf.InputError(f"all {count} simulations failed: {found.failures()[0][0]}")
@@ -219,6 +216,12 @@ class Posterior:
                 r = np.corrcoef(self.points[:, k], self.points[:, other])[0, 1]
                 found[self.names[k], self.names[other]] = float(r)
         return found
+
+
+def _first(stream: int) -> int:
+    """The number of the first simulation of a stream, whose random numbers no simulation that is
+    learnt from, and none of another stream, has used."""
+    return 2**24 + stream * 2**20
 
 
 def _most_frequent(values: np.ndarray) -> Value:

@@ -112,8 +112,7 @@ class Task(TaskOptions):
                 "cells", self.cells, f"above the {tried.founders} that a colony starts from"
             )
         dt = tried.dt if self.dt is None else checks.number("dt", self.dt, above=0.0)
-        steps = 1.0 if until is None else until / dt
-        if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
+        if until is not None and not _is_step(until, dt):
             raise checks.input_error("until", until, f"a whole number of steps of dt = {dt:g} h")
         own = self.target.time if isinstance(self.target, Observed) else None
         seen = max(self.target.times, default=None) if own is None else own
@@ -122,7 +121,7 @@ class Task(TaskOptions):
                 "until", until, f"at least {seen:g} h, when the target was observed"
             )
         for time in self.target.times:
-            if abs(round(time / dt) - time / dt) > 1e-6 * time / dt:
+            if not _is_step(time, dt):
                 raise checks.input_error(
                     "dt", dt, f"such that {time:g} h, when the target was observed, is a step"
                 )
@@ -301,3 +300,9 @@ def _whole_numbers(given: Any) -> list[int]:
     except TypeError:
         return []
     return found
+
+
+def _is_step(time: float, dt: float) -> bool:
+    """Whether a time, h, is one step of dt hours or a whole number of them."""
+    steps = time / dt
+    return round(steps) >= 1 and abs(steps - round(steps)) <= 1e-6 * steps

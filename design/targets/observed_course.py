@@ -64,6 +64,7 @@ class ObservedCourse(Observed):
     in another order, or of different numbers of colonies.
     """
 
+    plan: CourseStatistics  # type: ignore[assignment]
     frames: tuple[Observed, ...] = field(repr=False)
 
     def __init__(self, frames: Sequence[Observed]):
@@ -85,7 +86,7 @@ class ObservedCourse(Observed):
     @property
     def times(self) -> tuple[float, ...]:
         """Of the frames, h."""
-        return tuple(float(f.time or 0.0) for f in self.frames)
+        return self.plan.times
 
     def without(self, *groups: str) -> ObservedCourse:
         """The same data without the statistics of some groups, in all frames."""
@@ -176,7 +177,7 @@ def at(name: str, time: float) -> str:
 
 def _plain(name: str) -> str:
     """The name of the number of cells itself, in place of its logarithm."""
-    return name.replace(LOG_CELLS, "cells", 1) if name.startswith(LOG_CELLS) else name
+    return "cells" + name.removeprefix(LOG_CELLS) if name.startswith(LOG_CELLS) else name
 
 
 def _checked(frames: object) -> tuple[Observed, ...]:

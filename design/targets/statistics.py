@@ -298,12 +298,18 @@ def _over_pairs(value: Tensor, cells: SeenCells, pairs: Tensor) -> Tensor:
     return ratio(out[:, :1], out[:, 1:], 0.0)
 
 
+def _scatter(level: Tensor, mean: Tensor, cells: SeenCells) -> tuple[Tensor, Tensor, Tensor]:
+    """How far each cell is from the mean of its colony, (N,); the variance, (B, 1); and whether it
+    is more than roundings make, (B, 1) bool."""
+    apart = level - mean.squeeze(1).index_select(0, cells.colony)
+    variance = _means(apart.square().unsqueeze(1), cells)
+    return apart, variance, variance > STEADY * mean.square()
+
+
 def _variation(level: Tensor, mean: Tensor, cells: SeenCells) -> Tensor:
     """The standard deviation between the cells of a colony over their mean, (B, 1); 0 where all
     cells are alike."""
-    apart = level - mean.squeeze(1).index_select(0, cells.colony)
-    variance = _means(apart.square().unsqueeze(1), cells)
-    varied = variance > STEADY * mean.square()
+    _, variance, varied = _scatter(level, mean, cells)
     square = torch.where(varied, variance / torch.where(varied, mean.square(), 1.0), 1.0)
     return torch.where(varied, square.sqrt(), 0.0)
 
@@ -311,10 +317,8 @@ def _variation(level: Tensor, mean: Tensor, cells: SeenCells) -> Tensor:
 def _correlation(level: Tensor, mean: Tensor, cells: SeenCells, pairs: Tensor) -> Tensor:
     """Moran's I (Biometrika 37, 17, 1950): the mean over pairs of neighbours of the product of
     their deviations from the mean, over the variance, (B, 1); 0 where all cells are alike."""
-    apart = level - mean.squeeze(1).index_select(0, cells.colony)
-    variance = _means(apart.square().unsqueeze(1), cells)
+    apart, variance, varied = _scatter(level, mean, cells)
     together = apart.index_select(0, pairs[0]) * apart.index_select(0, pairs[1])
-    varied = variance > STEADY * mean.square()
     return torch.where(
         varied, _over_pairs(together, cells, pairs) / torch.where(varied, variance, 1.0), 0.0
     )

@@ -183,11 +183,8 @@ class BoundMonod(BoundEffect):
 
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         for other in effects:
-            # it may change what Monod has set
-            between = (self.stage, self.place) < (
-                other.stage,
-                other.place,
-            ) and other.stage <= GROWTH
+            after = (other.stage, other.place) > (self.stage, self.place)
+            between = after and other.stage <= GROWTH  # it may change what Monod has set
             if other is not self and not between and "growth_rate" in other.writes():
                 raise checks.InputError(
                     f"{other.title} sets growth_rate, which Monod sets again in every step. Let"
