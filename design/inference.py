@@ -13,6 +13,7 @@ import torchfilm as tf
 from design.neural_posterior import NeuralPosterior, require_sbi
 from design.parameters import Choice, Parameter
 from design.posterior import Posterior
+from design.prior import Prior
 from design.progress import advance, open_bar
 from design.simulations import Simulations, simulate_designs
 from design.targets.observed import Observed
@@ -33,6 +34,7 @@ def infer(
     until: float | None = None,
     replicates: int | None = None,
     fixed: Mapping[str, Any] | None = None,
+    prior: Mapping[str, Any] | None = None,
     seed: int = 0,
     dt: float | None = None,
     dtype: torch.dtype = torch.float32,
@@ -49,31 +51,24 @@ def infer(
         posterior = infer(my_scene, [Parameter("rate", 0.5, 2, log=True)], observed, until=5.0)
 
     Before the data, every value within the bounds is as likely as any other, on the logarithmic
-    scale where log=True. `simulations` designs are drawn so and grown, each with random numbers of
-    its own and `replicates` colonies, by default as many as were observed, whose statistics are
-    averaged. From these, neural posterior estimation (`NeuralPosterior`
-    names the sources) learns the density of the parameters, given statistics. Simulations that fail
-    are left out, so the posterior is that of colonies that do not.
+    scale where log=True, unless `prior` says more. `simulations` designs are drawn so and grown,
+    each with random numbers of its own and `replicates` colonies, by default as many as were
+    observed, whose statistics are averaged. From these, neural posterior estimation
+    (`NeuralPosterior` names the sources) learns the density of the parameters, given statistics.
+    Simulations that fail are left out, so the posterior is that of colonies that do not.
 
     scene, parameters, cells, fixed, seed, dt, dtype, device: as for `Search`. until: h, by default
     when the data were observed. replicates: with fewer than were observed, the posterior is wider
-    than the data allow. path: a file that keeps the simulations; running the same again
-    takes them from it, also for other data of the same statistics. samples: of the posterior.
-    flows, epochs: of the estimator; more flows are less sure. executor: of the
-    `concurrent.futures` kind, for other processes. progress: as for `Search.run`. Raises the errors
-    of `Task`, and InputError where sbi is missing (the `infer` extra), for the file of other
-    simulations, and where fewer than 50 simulations succeed.
+    than the data allow. prior: what is known before, by the names of parameters: for a number a
+    frozen distribution of scipy.stats, for a choice the share of each option (`Prior`). path: a
+    file that keeps the simulations; running the same again takes them from it, also for other data
+    of the same statistics. samples: of the posterior. flows, epochs: of the estimator; more flows
+    are less sure. executor: of the `concurrent.futures` kind, for other processes. progress: as for
+    `Search.run`. Raises the errors of `Task`, and InputError where sbi is missing (the `infer`
+    extra), for the file of other simulations, and where fewer than 50 simulations succeed.
     """
     require_sbi()
-    if not isinstance(observed, Observed):
-        if isinstance(observed, (list, tuple)):
-            raise tf.InputError(
-                "observed is one Observed, not a list: put data of several times together as"
-                " ObservedCourse([…])."
-            )
-        raise checks.input_error(
-            "observed", observed, "an Observed, such as Observed.from_table(…)"
-        )
+    _check_observed(observed)
     for name, value, least in (
         ("simulations", simulations, LEAST), ("samples", samples, 10), ("flows", flows, 1),
         ("epochs", epochs, 1),
@@ -87,10 +82,23 @@ def infer(
         replicates=observed.colonies if replicates is None else replicates,
         fixed=fixed, seed=seed, dt=dt, dtype=dtype, device=device, replay=False,
     )  # fmt: skip
-    found = _simulate(task, simulations, kept, executor, progress)
+    known = Prior(task.space, prior)
+    found = _simulate(task, known, simulations, kept, executor, progress)
     with open_bar(flows, progress, "infer", counted="flows") as bar:
         estimator = _learn(found, seed, flows, epochs, bar)
-    return Posterior.of(task, found, estimator, observed, samples)
+    return Posterior.of(task, known, found, estimator, observed, samples)
+
+
+def _check_observed(observed: Any) -> None:
+    if not isinstance(observed, Observed):
+        if isinstance(observed, (list, tuple)):
+            raise tf.InputError(
+                "observed is one Observed, not a list: put data of several times together as"
+                " ObservedCourse([…])."
+            )
+        raise checks.input_error(
+            "observed", observed, "an Observed, such as Observed.from_table(…)"
+        )
 
 
 def _check_end(seen: float | None, cells: int | None, until: float | None) -> None:
@@ -120,13 +128,18 @@ def _learn(found: Simulations, seed: int, flows: int, epochs: int, bar: Any) -> 
 
 
 def _simulate(
-    task: Task, count: int, path: Path | None, executor: Executor | None, progress: bool | None
+    task: Task,
+    prior: Prior,
+    count: int,
+    path: Path | None,
+    executor: Executor | None,
+    progress: bool | None,
 ) -> Simulations:
     """The simulations of a task. Raises InputError where too few succeed."""
     each = task.replicates
     with open_bar(count * each, progress, "infer") as bar:
         seen = lambda known: advance(bar, known * each - (bar.n if bar else 0))
-        found = simulate_designs(task, count, path=path, executor=executor, seen=seen)
+        found = simulate_designs(task, count, prior=prior, path=path, executor=executor, seen=seen)
     sound = int(found.sound.sum())
     if sound < LEAST:
         raise tf.InputError(

@@ -13,6 +13,7 @@ from design.neural_posterior import NeuralPosterior
 from design.parameters import Parameter, Value, show_value
 from design.posterior_plot import draw_corner
 from design.prediction import Prediction
+from design.prior import Prior
 from design.simulations import Simulations, random_points, shown_values, simulate_points
 from design.targets.observed import Observed
 from design.task import Task
@@ -22,6 +23,7 @@ LEVEL = 0.9  # of intervals, unless a caller gives one
 BEYOND = 0.002  # share of simulations beyond a statistic for which the model is questioned
 STREAM = 2  # of the truths of a calibration
 PREDICTED = 3  # of predictions
+DRAWN, PRIOR_DRAWN = 4, 20_000  # of points of the prior in a picture, and how many
 TOGETHER = 0.9  # a correlation from which the table tells of it
 
 
@@ -29,12 +31,14 @@ TOGETHER = 0.9  # a correlation from which the table tells of it
 class Posterior:
     """Parameters that could have grown the observed colonies.
 
-    task: scene, parameters and end of the colonies; simulations: what the posterior was learnt
+    task: scene, parameters and end of the colonies; prior: what was known of the parameters before;
+    simulations: what the posterior was learnt
     from; estimator: the density of parameters for any statistics; observed: the data. points: the
     samples, (S, D) coordinates in [0, 1].
     """
 
     task: Task
+    prior: Prior
     simulations: Simulations
     estimator: NeuralPosterior
     observed: Observed
@@ -43,6 +47,7 @@ class Posterior:
     @staticmethod
     def of(
         task: Task,
+        prior: Prior,
         simulations: Simulations,
         estimator: NeuralPosterior,
         observed: Observed,
@@ -51,7 +56,7 @@ class Posterior:
         """Draw the samples for some data."""
         row = np.array([observed.values])
         points = estimator.sample(row, samples, seed=task.seed)[0]
-        return Posterior(task, simulations, estimator, observed, points)
+        return Posterior(task, prior, simulations, estimator, observed, points)
 
     def given(self, observed: Observed) -> Posterior:
         """The posterior for other data of the same statistics (`Observed.from_table(…, like=…)`)
@@ -72,7 +77,8 @@ class Posterior:
                 f"data of {when:g} h, since the posterior was learnt from colonies of that age",
                 "Call infer(…) for data of another time.",
             )
-        return self.of(self.task, self.simulations, self.estimator, observed, len(self.points))
+        known = self.task, self.prior, self.simulations, self.estimator
+        return self.of(*known, observed, len(self.points))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -138,6 +144,7 @@ class Posterior:
                 low, high = (f"{v:.4g}" for v in intervals[p.name])
                 line += f"  {low} to {high}, of {p.low:g} to {p.high:g}"
                 line += " log" if p.log else ""
+                line += f", {self.prior.words(p.name)}" if p.name in self.prior.given else ""
             else:
                 share = np.mean(self.samples[p.name] == means[p.name])
                 line += f"  {100 * share:.0f} % of the samples"
@@ -163,10 +170,14 @@ class Posterior:
     def plot(
         self, out: str | Path | None = None, truth: dict[str, Value] | None = None
     ) -> tf.pictures.Picture:
-        """Draw the samples: of each parameter, and of each two of them. truth: values to mark.
+        """Draw the samples: of each parameter, and of each two of them; and the prior, where
+        something was known. truth: values to mark.
         out: as for `Best.plot`. Needs matplotlib (the `app` extra)."""
         marked = None if truth is None else self.task.space.point(truth)
-        return tf.pictures.Picture(draw_corner(self.task.space, self.points, marked), out)
+        before = None
+        if self.prior.given:
+            before = random_points(self.task, self.prior, PRIOR_DRAWN, stream=DRAWN)
+        return tf.pictures.Picture(draw_corner(self.task.space, self.points, marked, before), out)
 
     def check(self, truths: int = 200, *, samples: int = 999) -> Calibration:
         """Simulation-based calibration (Talts et al., arXiv 1804.06788): grow colonies of hidden,
@@ -174,7 +185,7 @@ class Posterior:
         costs `truths` simulations and no learning."""
         checks.integer("truths", truths, least=2)
         checks.integer("samples", samples, least=9)
-        points = random_points(self.task, truths, stream=STREAM)
+        points = random_points(self.task, self.prior, truths, stream=STREAM)
         found = simulate_points(self.task, points, _first(STREAM))
         kept = Simulations(points[found.sound], found.statistics[found.sound])
         drawn = self.estimator.sample(kept.statistics, samples, seed=self.task.seed + 1)

@@ -21,15 +21,18 @@ RANK_BINS = 10
 LIKELY = 0.99  # share of right posteriors whose bars lie within the band
 
 
-def draw_corner(space: Space, points: np.ndarray, truth: np.ndarray | None) -> Figure:
+def draw_corner(
+    space: Space, points: np.ndarray, truth: np.ndarray | None, before: np.ndarray | None = None
+) -> Figure:
     """Draw samples (S, D) in [0, 1]: histograms with the 90 % interval, and pairs, where the
     samples are. Axes are drawn in coordinates and labelled with values. truth: (D,) to mark, or
-    None."""
+    None. before: samples of the prior, to draw as a line, or None."""
     count = space.size
     figure = tf.pictures.new_figure(1.0 + 1.8 * count, 1.0 + 1.8 * count, dpi=130)
     legend = "histograms: samples; shaded: 90 % interval; blue: pairs of samples"
     legend = legend if count > 1 else legend.rpartition(";")[0]
     legend += "" if truth is None else "; red: truth"
+    legend += "" if before is None else "; line: before the data"
     figure.suptitle(textwrap.fill(legend, 14 + 30 * count), fontsize=8)
     edges = [_edges(p, points[:, k], truth, k) for k, p in enumerate(space.parameters)]
     grid: Any = figure.subplots(count, count, squeeze=False)
@@ -41,6 +44,10 @@ def draw_corner(space: Space, points: np.ndarray, truth: np.ndarray | None) -> F
         x, y = points[:, column], points[:, row]
         if row == column:
             ax.hist(x, edges[column], color="C0")
+            if before is not None:
+                shares = np.full(len(before), len(x) / len(before))
+                drawn = dict(histtype="step", color="0.3", lw=1.0)
+                ax.hist(before[:, column], edges[column], weights=shares, **drawn)
             ax.axvspan(*np.quantile(x, INTERVAL), color="C0", alpha=0.15, lw=0)
         else:
             ax.hist2d(x, y, (edges[column], edges[row]), cmap="Blues")

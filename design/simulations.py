@@ -22,6 +22,7 @@ from design.data_file import reading, replacing, write_values
 from design.executors import check_executor
 from design.growing import FailedColony, grow
 from design.parameters import Value
+from design.prior import Prior
 from design.scoring import WorkItem, cut_work_items
 from design.targets.observed import Observed
 from design.task import Task
@@ -35,7 +36,7 @@ BATCH = 256  # designs that are grown at once, and after which the file is writt
 class Simulations:
     """Statistics of colonies of random parameters.
 
-    points: coordinates of the parameters, (n, D) in [0, 1], drawn evenly; statistics: (n, K), means
+    points: coordinates of the parameters, (n, D) in [0, 1]; statistics: (n, K), means
     over the colonies of each, NaN where one of them failed. reasons: of failures, by row.
     """
 
@@ -77,10 +78,12 @@ def observed_of(task: Task) -> Observed:
     return task.target
 
 
-def about(task: Task) -> dict[str, Any]:
+def about(task: Task, prior: Prior) -> dict[str, Any]:
     """What simulations depend on, as plain data: all of the task but the observed numbers."""
     found = task.describe() | {"target": repr(observed_of(task).plan)}
     del found["code of the target"], found["reduce"]
+    if prior.given:
+        found["prior"] = prior.describe()
     return found
 
 
@@ -88,11 +91,12 @@ def simulate_designs(
     task: Task,
     count: int,
     *,
+    prior: Prior | None = None,
     path: Path | None = None,
     executor: Executor | None = None,
     seen: Callable[[int], None] = lambda count: None,
 ) -> Simulations:
-    """Simulate `count` designs with parameters drawn evenly from the space, each with
+    """Simulate `count` designs with parameters drawn from the prior (by default evenly), each with
     `task.replicates` colonies and random numbers of its own.
 
     path: of the file that keeps them; those that it holds are not simulated again. executor: of the
@@ -102,15 +106,17 @@ def simulate_designs(
     """
     if executor is not None:
         check_executor(executor)
-    known = _read(path, task)
+    prior = prior or Prior(task.space)
+    known = _read(path, task, prior)
     seen(min(count, len(known)))
-    points = np.random.default_rng(task.seed).random((max(count, len(known)), task.space.size))
+    draws = np.random.default_rng(task.seed)
+    points = prior.points(draws.random((max(count, len(known)), task.space.size)))
     starts = range(len(known), count, BATCH)
     parts = [(first, points[first : min(first + BATCH, count)]) for first in starts]
     run = partial(_simulate_part, task)
     for found in map(run, parts) if executor is None else executor.map(run, parts):
         known = known.followed_by(found)
-        _write(path, task, known)
+        _write(path, task, prior, known)
         seen(len(known))
     return known.take(slice(0, count))
 
@@ -174,9 +180,10 @@ def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.nda
     return [(row, means[k], reasons.get(k, "")) for k, row in enumerate(item.rows)]
 
 
-def random_points(task: Task, count: int, *, stream: int) -> np.ndarray:
+def random_points(task: Task, prior: Prior, count: int, *, stream: int) -> np.ndarray:
     """Further random designs, (n, D), none of those that `simulate_designs` draws."""
-    return np.random.default_rng([task.seed, stream]).random((count, task.space.size))
+    draws = np.random.default_rng([task.seed, stream])
+    return prior.points(draws.random((count, task.space.size)))
 
 
 def shown_values(task: Task, points: np.ndarray) -> dict[str, list[Value]]:
@@ -185,11 +192,11 @@ def shown_values(task: Task, points: np.ndarray) -> dict[str, list[Value]]:
     return {name: [values[name] for values in found] for name in task.space.names}
 
 
-def _write(path: Path | None, task: Task, known: Simulations) -> None:
+def _write(path: Path | None, task: Task, prior: Prior, known: Simulations) -> None:
     """In place of the older file, where there is one."""
     if path is None:
         return
-    with replacing(path, FORMAT, VERSION, about(task), "earlier simulations") as file:
+    with replacing(path, FORMAT, VERSION, about(task, prior), "earlier simulations") as file:
         file["points"], file["statistics"] = known.points, known.statistics
         names = list(observed_of(task).plan.names)
         file.create_dataset("names", data=names, dtype=h5py.string_dtype())
@@ -198,14 +205,14 @@ def _write(path: Path | None, task: Task, known: Simulations) -> None:
         file.attrs["reasons"] = json.dumps(known.reasons)
 
 
-def _read(path: Path | None, task: Task) -> Simulations:
+def _read(path: Path | None, task: Task, prior: Prior) -> Simulations:
     """What a file holds; nothing where there is none. Raises InputError for the file of another
     task and for one that cannot be read."""
     names = observed_of(task).plan.names
     if path is None or not path.exists():
         return Simulations(np.empty((0, task.space.size)), np.empty((0, len(names))))
     with reading(path, FORMAT, VERSION, "file of simulations") as file:
-        kept, mine = json.loads(file.attrs["about"]), about(task)
+        kept, mine = json.loads(file.attrs["about"]), about(task, prior)
         reasons = {int(k): words for k, words in json.loads(file.attrs["reasons"]).items()}
         found = Simulations(file["points"][...], file["statistics"][...], reasons)
         kept["statistics"] = [n.decode() for n in file["names"][...]]
