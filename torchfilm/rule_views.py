@@ -41,6 +41,7 @@ IDENTITY = ("uid", "parent", "colony")
 # fields that only an effect acts on
 OF_EFFECTS = {"growth_rate": "tf.Growth()", "divide_flag": "tf.Division()"}
 SECRETES = "a circuit says what cells give to a signal and take from it"
+ONE_BY_ONE = ("random", "chance", "binomial")
 KNOWN_FIELDS = {
     "cell_type": CELL_TYPE,
     "drag": Field("drag", "factor on the viscosity that this cell feels", initial=1.0),
@@ -89,6 +90,7 @@ class CellsView(Draws):
     _written: set[str]
     _declaring: bool
     _draws: int
+    _draws_of: dict[int, OneCell]
 
     def __init__(self, state: State, dt: float, label: str, declaring: bool = False):
         # bypasses __setattr__, which is for rules
@@ -103,6 +105,7 @@ class CellsView(Draws):
             _written=set(),
             _declaring=declaring,
             _draws=0,
+            _draws_of={},
         )
 
     @property
@@ -273,6 +276,14 @@ class CellsView(Draws):
         return torch.bincount(torch.cat([i, j]), minlength=self._state.cells)
 
 
+class OneCell(Draws):
+    """What a loop over cells draws for one of them: its numbers do not depend on the others."""
+
+    def __init__(self, cells: CellsView, index: int):
+        self._state, self._draws, self._purpose = cells._state, 0, f"{cells._purpose} one by one"
+        self._rows = torch.tensor([index], device=cells._state.device)
+
+
 class CellView:
     """One cell of a CellsView: the same names, one value each.
 
@@ -290,8 +301,14 @@ class CellView:
             raise AttributeError(name)
         found = getattr(self._cells, name)
         if name == "signals":
-            return Names(tuple(found), [found[n][self._index] for n in found], "cell.signals")
-        return found[self._index]
+            one = [found[n][self._index] for n in found]
+            return Names(tuple(found), one, "cell.signals", SECRETES)
+        if name in ONE_BY_ONE:
+            drawn = self._cells._draws_of.setdefault(self._index, OneCell(self._cells, self._index))
+            return lambda *given: getattr(drawn, name)(*given)[0]
+        if callable(found):
+            raise RuleError(f"{name} is of all cells: call cells.{name}(…) outside the loop.")
+        return found[self._index] if isinstance(found, Tensor) else found
 
     def __setattr__(self, name: str, value: Any) -> None:
         name = PAPER_NAMES.get(name, name)

@@ -358,3 +358,33 @@ def test_rules_for_each_colony_mix_nothing():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         tf.Scene(tf.Rules(own), tf.Growth(), dim=2).bind(3)
+
+
+def test_a_cell_of_a_loop_draws_numbers_of_its_own_whatever_the_batch():
+    def update(cells):
+        for cell in cells:
+            cell.drawn = cell.random()
+            if cell.chance(0.3):
+                cell.hits += 1
+            cell.kept = cell.binomial(5, 0.5)
+            assert cell.dt == cells.dt
+
+    variables = {"drawn": 0.0, "hits": 0, "kept": 0}
+    scene = growing(tf.Rules(update, variables=variables), tf.Growth(rate=1.0))
+    *_, many = tf.simulate(scene, until=1.0, dt=0.02, colonies=30, seed=4)
+    *_, one = tf.simulate(scene, until=1.0, dt=0.02, colonies=1, seed=4)
+    for name in variables:
+        assert torch.equal(one.fields[name], many.fields[name][many.colony == 0])
+    assert many.drawn.unique().numel() == many.cells
+    # 50 steps of probability 0.3, and means of 5 halves: each within four standard errors
+    assert (many.hits.double().mean() - 15).abs() < 4 * math.sqrt(50 * 0.21 / many.cells)
+    assert (many.kept.double().mean() - 2.5).abs() < 4 * math.sqrt(1.25 / many.cells)
+
+
+def test_what_is_of_all_cells_is_not_asked_of_one():
+    def update(cells):
+        for cell in cells:
+            cell.contact_count()
+
+    with pytest.raises(tf.InputError, match=r"cells\.contact_count\(…\) outside the loop"):
+        growing(tf.Rules(update)).bind().start()
