@@ -57,12 +57,53 @@ def free_bytes(device: str) -> int:
             + torch.cuda.memory_reserved(device)
             - torch.cuda.memory_allocated(device)
         )
-    for line in (
-        Path("/proc/meminfo").read_text().splitlines() if Path("/proc/meminfo").exists() else ()
-    ):
+    for line in _text(Path("/proc/meminfo")).splitlines():
         if line.startswith("MemAvailable:"):
-            return 1024 * int(line.split()[1])
+            return min(1024 * int(line.split()[1]), bytes_of_group())
     return 4 * 2**30  # not Linux: a size that any machine has
+
+
+# Of a control group: the files with its limit, with what it uses, and what of that are copies of
+# files, which give way. Version 2 and 1.
+GROUP_FILES = ("memory.max", "memory.current", "inactive_file")
+OLD_GROUP_FILES = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+
+
+def bytes_of_group(
+    root: Path = Path("/sys/fs/cgroup"), listed: Path = Path("/proc/self/cgroup")
+) -> int:
+    """Bytes of memory that the control groups of this process leave it, as a container or a job of
+    a cluster has them; 2^63 where there are none. What is free on the machine does not show them,
+    and who takes more is killed."""
+    least = 2**63
+    # a container sees its own group at the root, whatever is listed
+    for line in ["0::/", "0:memory:/", *_text(listed).splitlines()]:
+        _, kind, path = line.split(":", 2)
+        if kind in ("", "memory"):
+            top, names = (root / "memory", OLD_GROUP_FILES) if kind else (root, GROUP_FILES)
+            folder = top / path.lstrip("/")
+            for place in (folder, *folder.parents):
+                least = min(least, _left_by(place, *names))
+                if place == top:
+                    break
+    return least
+
+
+def _left_by(group: Path, most: str, used: str, kept: str) -> int:
+    """Bytes that one control group leaves; 2^63 where it has no limit."""
+    limit, taken = (_text(group / name).strip() for name in (most, used))
+    if not (limit.isdigit() and taken.isdigit()):
+        return 2**63
+    stat = dict(line.split(" ", 1) for line in _text(group / "memory.stat").splitlines())
+    return max(0, int(limit) - int(taken) + int(stat.get(kept, 0)))
+
+
+def _text(path: Path) -> str:
+    """The text of a file, "" where it cannot be read."""
+    try:
+        return path.read_text()
+    except OSError:
+        return ""
 
 
 def is_lack_of_memory(error: BaseException) -> bool:
