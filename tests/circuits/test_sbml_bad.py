@@ -176,7 +176,7 @@ OPTIONS = [
     ({"initial": {"lux": 1.0}}, "initial names 'lux', which is no variable.*'luxi'"),
     ({"species": ("luxi",)}, "species = .*left to the model"),
     ({"methodd": "euler"}, "no constant 'methodd'"),
-    ({"method": "tau_leap", "dilution": True}, "for reactions"),
+    ({"method": "tau_leap"}, "'leave' changes 'ahl' and 'ahl_out', which are in compartments"),
 ]
 
 

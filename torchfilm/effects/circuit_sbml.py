@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchfilm.circuits import sbml
 from torchfilm.circuits.names import label_of, unknown
-from torchfilm.effects.circuit_checks import GEOMETRY
+from torchfilm.effects.circuit_checks import DIRECT, GEOMETRY, LEAP
 from torchfilm.parameters import shorten
 from torchfilm.state import RESERVED
 from torchfilm.tools import checks
@@ -93,6 +93,7 @@ def model_choices(
         time_unit=time_unit,
         values={n: x for n, x in keywords.items() if n not in options},
         initial=initial or {},
+        molecules=keywords.get("method") in (DIRECT, LEAP),
         options=options,
         fields=(*RESERVED, *GEOMETRY),
     )

@@ -106,9 +106,9 @@ class Quantities:
         if kind != SPECIES:
             return False
         free = not (thing.getBoundaryCondition() or thing.getConstant())
-        return free or self._size_changes(thing)
+        return free or self.size_changes(thing)
 
-    def _size_changes(self, species: Any) -> bool:
+    def size_changes(self, species: Any) -> bool:
         """Whether the compartment of a species that holds a concentration changes its size."""
         home = species.getCompartment()
         if species.getHasOnlySubstanceUnits() or home in self.choices.cell:
@@ -268,7 +268,7 @@ class Quantities:
         thing = self.things[name][1]
         amounts = thing.getHasOnlySubstanceUnits()
         total = self.gained(name, 1.0 if amounts else self.size(thing))
-        if not amounts and self._size_changes(thing):
+        if not amounts and self.size_changes(thing):
             size = self.size(thing)
             own = calculate(b, "mul", self.value(name), over(b, self.change(size), size))
             total = less(b, total, own)
@@ -280,7 +280,7 @@ class Quantities:
         for reaction, reference, sign in self.changes.get(name, ()):
             b, part = self.builder, over(self.builder, self.value(reaction), size)
             count = self.stoichiometry(reference)
-            factor = self._conversion(name)
+            factor = self.conversion(name)
             count = count if factor is None else calculate(b, "mul", count, factor)
             if not isinstance(count, (int, float)) or count != 1:
                 part = calculate(b, "mul", count, part)
@@ -290,7 +290,7 @@ class Quantities:
                 total = calculate(b, "add" if sign > 0 else "sub", total, part)
         return 0.0 if total is None else total
 
-    def _conversion(self, species: str) -> Term | None:
+    def conversion(self, species: str) -> Term | None:
         """The factor from the extent of reactions to the substance of a species."""
         thing = self.things[species][1]
         own = thing.getConversionFactor() if self.model.getLevel() > 2 else ""

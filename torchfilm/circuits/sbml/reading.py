@@ -10,7 +10,8 @@ from typing import Any
 from torchfilm.circuits.equations import Equations, Term
 from torchfilm.circuits.expressions import Builder, Expression
 from torchfilm.circuits.names import unknown
-from torchfilm.circuits.sbml import own_marks, units
+from torchfilm.circuits.reactions import Reaction
+from torchfilm.circuits.sbml import molecules, own_marks, units
 from torchfilm.circuits.sbml.document import open_model
 from torchfilm.circuits.sbml.mathml import Formulas, Function, calculate
 from torchfilm.circuits.sbml.quantities import CLOCK, PARAMETER, SPECIES, Choices, Quantities
@@ -29,8 +30,9 @@ OPTIONS = (
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """What the user says of a model; see `Circuit.from_sbml`. values: of constants.
-    options: names that no id can have in the circuit. fields: names that no variable can have."""
+    """What the user says of a model; see `Circuit.from_sbml`. values: of constants. molecules:
+    whether it is to run molecule by molecule. options: names that no id can have in the circuit.
+    fields: names that no variable can have."""
 
     signals: Mapping[str, str]
     properties: Mapping[str, str]
@@ -38,16 +40,17 @@ class Given:
     time_unit: str | None
     values: Mapping[str, Any]
     initial: Mapping[str, Any]
+    molecules: bool = False
     options: Collection[str] = ()
     fields: Collection[str] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """A model as a circuit: its rates, variables, their first values and constants by name, and
-    the variables that growth dilutes. quantities: what its ids stand for."""
+    """A model as a circuit: its rates or reactions, variables, their first values and constants by
+    name, and the variables that growth dilutes. quantities: what its ids stand for."""
 
-    rates: Equations
+    rates: Equations | list[Reaction]
     species: tuple[str, ...]
     initial: Mapping[str, Any]
     parameters: Mapping[str, Any]
@@ -121,31 +124,45 @@ def _by_id(rename: Mapping[str, str]) -> Callable[[Mapping[str, Any]], dict[str,
 def _describe(
     document: Any, quantities: Quantities, marks: own_marks.Marks, given: Given
 ) -> Description:
-    model, builder, per_hour = quantities.model, quantities.builder, quantities.choices.per_hour
     variables = _ordered(quantities)
-    rates = {n: _per_hour(quantities, quantities.rate(n)) for n in variables}
-    releases = dict(_releases(quantities, variables, bool(marks)))
     names = {n: quantities.column(n) for n in variables}
+    rates: Equations | list[Reaction]
+    if given.molecules:
+        rates, read = molecules.reactions(quantities, tuple(names.values()))
+    else:
+        rates, read = _equations(quantities, names, bool(marks))
     initial = {new: _first(quantities, old, given.initial) for old, new in names.items()}
     if quantities.clock:
-        rates[TIME] = builder.number(per_hour)
         names[TIME], initial[TIME] = TIME, 0.0
     if not names:
         raise InputError("nothing in the model changes: it has no reaction and no rate rule")
     _check_given(quantities, given)
-    made = {names[n]: e for n, e in rates.items() if not e.is_number(0)}
-    species = tuple(names.values())
     things = quantities.things
     diluted = [new for old, new in names.items() if old in things and things[old][0] == SPECIES]
     return Description(
-        Equations.of(_title(model), species, made, releases),
-        species,
+        rates,
+        tuple(names.values()),
         initial,
-        _constants(quantities, [*made.values(), *releases.values()], bool(marks)),
+        _constants(quantities, read, bool(marks)),
         tuple(n for n in diluted if n not in marks.undiluted),
         quantities,
         document,
     )
+
+
+def _equations(
+    quantities: Quantities, names: Mapping[str, str], ours: bool
+) -> tuple[Equations, list[Expression]]:
+    """The rates of the variables, by their names in the circuit, and of signals, and all of them as
+    expressions."""
+    rates = {n: _per_hour(quantities, quantities.rate(n)) for n in names}
+    releases = dict(_releases(quantities, tuple(names), ours))
+    species = dict(names)
+    if quantities.clock:
+        rates[TIME], species[TIME] = quantities.builder.number(quantities.choices.per_hour), TIME
+    made = {species[n]: e for n, e in rates.items() if not e.is_number(0)}
+    equations = Equations.of(_title(quantities.model), tuple(species.values()), made, releases)
+    return equations, [*made.values(), *releases.values()]
 
 
 def _title(model: Any) -> str:
