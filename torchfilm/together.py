@@ -10,7 +10,8 @@ fast, both follow. Anderson's mixing solves it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -117,7 +118,13 @@ class Together:
         """The same part in turns: circuits with pools, and then transport."""
         for circuit in self.circuits:
             state = circuit.turn(state, dt, done, number)
-        return self.medium.transport.carried(state, dt, dt, names=frozenset(self.names))
+        state = self.medium.transport.carried(state, dt, dt, names=frozenset(self.names))
+        every = torch.ones(state.colonies, dtype=torch.int64, device=state.device)
+        noted = {}
+        for title in (c.title for c in self.circuits):
+            report: Any = state.reports[title]
+            noted[title] = replace(report, unsolved=report.unsolved + every)
+        return state.replace(reports={**state.reports, **noted})
 
     def _chosen(self, made: State, halved: State, again: Tensor) -> State:
         """The one state, or in these colonies (B,) the other."""
@@ -158,7 +165,8 @@ class Together:
         for circuit, report in zip(self.circuits, outcome.reports, strict=True):
             well = report.status == 0
             report.note_colonies(greedy & well, GREEDY)
-            noted = {"iterations": fixed.iterations, "overdrawn": overdrawn}
+            none = torch.zeros_like(fixed.iterations)
+            noted = {"iterations": fixed.iterations, "overdrawn": overdrawn, "unsolved": none}
             made = circuit.reported(made, report, None, step.done, noted)
         return made, fixed.failed | greedy, greedy
 

@@ -143,7 +143,7 @@ def test_signals_take_whole_molecules_and_none_is_lost():
         ("species a; make: -> a; k*time; k = 1; a = 0;", "'make' depends on the time"),
         ("species a; make: -> 1.5 a; k; k = 1; a = 0;", "a number that is not whole"),
         (
-            "compartment c = 1, n = 2; species a in c, b in n; go: a -> b; k*a; k = 1; a = 1; b = 0",
+            "compartment c = 1, n = 2; species a in c, b in n; go: a -> b; k*a; k = 1; a = 1",
             "'a' and 'b', which are in compartments of their own",
         ),
         (

@@ -336,3 +336,43 @@ def test_a_method_of_turns_means_turns(given):
     assert report.exchanged is not None and not isinstance(report.iterations, torch.Tensor)
     with pytest.raises(tf.InputError, match="method and splitting are of turns"):
         resting(medium(**given), exchanging(), SIX).bind()
+
+
+def eating(u, s, p, cell):
+    return {"dm": 0.0 * u.dm}, {"o2": -p.q * cell.volume * s.o2 / (p.K + s.o2)}
+
+
+def breathing(eaters: tuple, q: float, K: float, diffusion: float) -> tf.Scene:
+    """Cells that take up what comes from the sides, 1e5 times what is there in a step."""
+    fed = tf.BoundaryConditions(x=tf.Dirichlet(1.0), y=tf.Dirichlet(1.0))
+    food = tf.Medium(
+        o2=tf.Signal(diffusion, initial=1.0, boundary=fed), box=BOX, spacing=4.0, depth=1.0
+    )
+    return tf.Scene(*eaters, food, founders=tf.inoculum(40, radius=12.0), dim=2)
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_cells_that_live_on_what_reaches_them_take_as_much_as_by_monod(backend):
+    """The residual of a solve must not hide what a hungry cell finds."""
+    q, K, diffusion = 2e5, 1e-3, 1e6
+    circuit = tf.Circuit(eating, species="dm", q=q, K=K, backend=backend, rtol=1e-7, atol=1e-12)
+    monod = tf.Monod("o2", rate=1e-3, half=K, growth_yield=1e-3 / q)
+    ends = []
+    for eaters in ((tf.Growth(rate=1e-3), circuit), (tf.Growth(), monod)):
+        scene = breathing(eaters, q, K, diffusion)
+        *_, state = tf.simulate(scene, until=0.05, dt=0.025, dtype=F64)
+        ends.append(state.signals["o2"])
+        report = state.reports.get("circuit")
+    assert report is None and float(ends[1].min()) < 0.01 < 0.1 < float(ends[1].mean())
+    np.testing.assert_allclose(ends[0], ends[1], rtol=1e-3, atol=1e-4)
+
+
+def test_an_equation_that_is_not_solved_is_warned_of(monkeypatch):
+    monkeypatch.setattr(together, "MOST", 1)
+    monkeypatch.setattr(together, "FINEST", 2)
+    eaters = tf.Growth(rate=1e-3), tf.Circuit(eating, species="dm", q=2e5, K=1e-3)
+    scene = breathing(eaters, 2e5, 1e-3, 1e6)
+    words = "could not be solved together.*took turns there"
+    with pytest.warns(RuntimeWarning, match=words):
+        *_, state = tf.simulate(scene, until=0.05, dt=0.025)
+    assert state.reports["circuit"].unsolved.tolist() == [2]

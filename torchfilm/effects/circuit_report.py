@@ -27,8 +27,9 @@ class CircuitReport:
     """`status` (B,): 0, or 1 where a cell's circuit could not be stepped, and `words`, by place in
     the batch, what happened there. steps, (N,) int64: how many steps each cell's circuit took.
     exchanged: what cells gave to the medium; None without one. Where exchange and transport are
-    solved together, (B,) each: the iterations; and what cells took of signals beyond what there
-    was, conc·µm³, as it may be within the circuits' tolerance."""
+    solved together, (B,) each: the iterations; what cells took of signals beyond what there was,
+    conc·µm³, as it may be within the circuits' tolerance; and how many parts of the step were taken
+    in turns, since their equation could not be solved."""
 
     status: Tensor
     steps: Tensor
@@ -36,6 +37,7 @@ class CircuitReport:
     exchanged: Exchanged | None = None
     iterations: Tensor | int = 0
     overdrawn: Tensor | float = 0.0
+    unsolved: Tensor | int = 0
     hint = (
         "Look at the signs of the rates (none may be below 0 where its species is 0), at their"
         " units (per hour), and at whether they stay finite; a smaller dt may help"
@@ -59,6 +61,7 @@ class CircuitReport:
             ),
             iterations=earlier.iterations + self.iterations,
             overdrawn=earlier.overdrawn + self.overdrawn,
+            unsolved=earlier.unsolved + self.unsolved,
         )
 
     def or_else(self, other: CircuitReport, where: Tensor, colony: Tensor) -> CircuitReport:
@@ -72,6 +75,7 @@ class CircuitReport:
             | {k: w for k, w in other.words.items() if k in places},
             iterations=torch.where(where, other.iterations, self.iterations),
             overdrawn=torch.where(where, other.overdrawn, self.overdrawn),
+            unsolved=torch.where(where, other.unsolved, self.unsolved),
         )
 
     @property
@@ -81,8 +85,11 @@ class CircuitReport:
         return none if self.exchanged is None else self.exchanged.swing
 
     def concerns(self) -> list[Concern]:
-        """Colonies in which exchange and transport lag behind each other for long. Small ones are
-        left out: around a few cells a signal is weak, and its swing says little."""
+        """Colonies whose exchange and transport could not be solved together; and those in which
+        they lag behind each other for long. Small ones are left out of these: around a few cells a
+        signal is weak, and its swing says little."""
+        if isinstance(self.unsolved, Tensor) and bool((self.unsolved > 0).any()):
+            return [Concern("unsolved", self.unsolved > 0, 1, _of_unsolved)]
         exchanged = self.exchanged
         if exchanged is None or exchanged.step % LOOK or exchanged.groups.owner.numel() < CROWD:
             return []
@@ -93,6 +100,15 @@ class CircuitReport:
             swing = self.swing
         where = (swing > SWING) & crowd
         return [Concern("swing", where, LASTING, partial(_of_swing, swing))]
+
+
+def _of_unsolved(ids: Tensor, where: Tensor) -> str:
+    return (
+        f"colony {', '.join(map(str, ids[where].tolist()[:5]))}: exchange and transport of signals"
+        " could not be solved together, not even in a sixteenth of a step, so that they took turns"
+        " there: what cells take may be far from right. Give a smaller dt, or a rate of exchange"
+        " that changes less steeply with the signal."
+    )
 
 
 def _of_swing(swing: Tensor, ids: Tensor, where: Tensor) -> str:

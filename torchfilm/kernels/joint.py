@@ -93,7 +93,8 @@ def move(
         turned[colony] |= far[c] != before
         for i in range(size):
             out[start + i] = final[i] if good else np.nan
-        put_read(at_end[cells], final, *place)
+        # backward Euler ends at its mean, but for a residual that may exceed what a cell finds
+        put_read(at_end[cells], mean if far[c] else final, *place)
         put_read(average[cells], mean, *place)
         for i in range(first, last):
             if not fed[i]:
@@ -180,19 +181,20 @@ def put_turned_shares(dmore, dloss, drates, given, guess, dgiven, dguess, fed, n
 
 
 @kernel
-def turned_euler(u, du, more, dmore, dloss, dt, pad, grid, times, within, operator, room, most):
+def turned_euler(u, du, more, dmore, dloss, dt, pad, grid, times, operator, room, settings):
     """The tangents of a step of backward Euler of one grid, to `final` and `mean` of the room.
-    Whether both solves converged. within: of a residual. most: iterations."""
+    Whether both solves converged. settings: as of `uptake.carry_once`."""
+    _, _, _, within, rounding, most = settings
     x, r, b, final, mean, spare, symmetric = (
         room[2], room[3], room[4], room[5], room[6], room[7], operator[8],
     )  # fmt: skip
     for i in range(u.size):
         x[pad + i], b[i] = u[i], u[i] + dt * more[i]
-    good = backward_euler(x, b, r, pad, grid, times, within, symmetric, most, spare)
+    good = backward_euler(x, b, r, pad, grid, times, within, rounding, symmetric, most, spare)
     for i in range(u.size):
         b[i] = du[i] + dt * (dmore[i] - dloss[i] * x[pad + i])
         x[pad + i] = du[i]
-    good &= backward_euler(x, b, r, pad, grid, times, within, symmetric, most, spare)
+    good &= backward_euler(x, b, r, pad, grid, times, within, rounding, symmetric, most, spare)
     for i in range(u.size):
         final[i] = mean[i] = x[pad + i]
     return good
@@ -229,13 +231,11 @@ def move_turned(
         )  # fmt: skip
         for i in range(size):
             u[i], du[i] = values[start + i], dvalues[start + i]
-        fastest, at, grid = with_losses(dt, operator, room, settings)
+        at, grid = with_losses(dt, operator, room, settings)
         times, good = at * dt, True
         if far[c]:
-            within = max(settings[3], settings[4] * dt * fastest)
             turned = more, dmore, dloss
-            good = turned_euler(u, du, *turned, dt, pad, grid, times, within, operator, room,
-                                settings[5])  # fmt: skip
+            good = turned_euler(u, du, *turned, dt, pad, grid, times, operator, room, settings)
         else:
             used = poisson(times, settings[1], weights, tails)
             turned_series(u, du, pad, grid, weights, tails, used, more / at, dmore / at, dloss / at,

@@ -11,6 +11,9 @@ import numpy as np
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.transport import exchanged
 
+# Rows that a solve works in.
+SPARE = 7
+
 
 @kernel(any_order=True)
 def dot(a, b):
@@ -38,46 +41,54 @@ def _ratio(a, b):
 
 
 @kernel
-def conjugate_gradients(x, r, pad, grid, many, target, most, spare):
-    """As `transport_iterative._conjugate_gradients`: x and r in place; x, spare: with padding."""
+def conjugate_gradients(x, r, pad, grid, many, inverse, target, most, spare):
+    """As `transport_iterative._conjugate_gradients`: x and r in place; x, spare: with padding;
+    inverse: of the diagonal."""
     size = r.size
     p, q = spare[0], spare[1, :size]
     for i in range(size):
-        p[pad + i] = r[i]
-    squared = dot(r, r)
+        p[pad + i] = inverse[i] * r[i]
+    product_of = dot(p[pad : pad + size], r)
     for _ in range(most):
         product(p, q, pad, grid, many)
-        alpha = _ratio(squared, dot(p[pad : pad + size], q))
+        alpha = _ratio(product_of, dot(p[pad : pad + size], q))
         for i in range(size):
             x[pad + i] += alpha * p[pad + i]
             r[i] -= alpha * q[i]
-        new = dot(r, r)
-        if not new > target:
+        if not dot(r, r) > target:
             return
-        beta, squared = _ratio(new, squared), new
         for i in range(size):
-            p[pad + i] = r[i] + beta * p[pad + i]
+            q[i] = inverse[i] * r[i]
+        new = dot(q, r)
+        beta, product_of = _ratio(new, product_of), new
+        for i in range(size):
+            p[pad + i] = q[i] + beta * p[pad + i]
 
 
 @kernel
-def bicgstab(x, r, pad, grid, many, target, most, spare):
-    """As `transport_iterative._bicgstab`: x and r in place; x, spare: with padding."""
+def bicgstab(x, r, pad, grid, many, inverse, target, most, spare):
+    """As `transport_iterative._bicgstab`: x and r in place; x, spare: with padding; inverse: of the
+    diagonal."""
     size = r.size
-    p, s = spare[0], spare[1]
+    p, s, scaled = spare[0, :size], spare[1, :size], spare[5]
     v, t, shadow = spare[2, :size], spare[3, :size], spare[4, :size]
     for i in range(size):
-        p[pad + i] = shadow[i] = r[i]
+        p[i] = shadow[i] = r[i]
     rho = dot(r, r)
     for _ in range(most):
-        product(p, v, pad, grid, many)
+        for i in range(size):
+            scaled[pad + i] = inverse[i] * p[i]
+        product(scaled, v, pad, grid, many)
         alpha = _ratio(rho, dot(shadow, v))
         for i in range(size):
-            s[pad + i] = r[i] - alpha * v[i]
-        product(s, t, pad, grid, many)
-        omega = _ratio(dot(t, s[pad : pad + size]), dot(t, t))
+            x[pad + i] += alpha * scaled[pad + i]
+            s[i] = r[i] - alpha * v[i]
+            scaled[pad + i] = inverse[i] * s[i]
+        product(scaled, t, pad, grid, many)
+        omega = _ratio(dot(t, s), dot(t, t))
         for i in range(size):
-            x[pad + i] += alpha * p[pad + i] + omega * s[pad + i]
-            r[i] = s[pad + i] - omega * t[i]
+            x[pad + i] += omega * scaled[pad + i]
+            r[i] = s[i] - omega * t[i]
         if not dot(r, r) > target:
             return
         new = dot(shadow, r)
@@ -86,44 +97,49 @@ def bicgstab(x, r, pad, grid, many, target, most, spare):
             return
         beta, rho = _ratio(new, rho) * _ratio(alpha, omega), new
         for i in range(size):
-            p[pad + i] = r[i] + beta * (p[pad + i] - omega * v[i])
+            p[i] = r[i] + beta * (p[i] - omega * v[i])
 
 
 @kernel
-def backward_euler(x, b, r, pad, grid, many, tolerance, symmetric, most, spare):
+def backward_euler(x, b, r, pad, grid, many, tolerance, rounding, symmetric, most, spare):
     """Solve (I + many (I − P)) x = b for one grid, from x, and leave the residual in r. Whether it
-    converged."""
-    target = tolerance**2 * dot(b, b)
+    converged. tolerance: of the residual over b. rounding: times many, over x. spare: `SPARE` rows,
+    0 in their padding."""
+    inverse, stay, inner = spare[6, : b.size], grid[1], x[pad : pad + b.size]
+    for i in range(b.size):
+        inverse[i] = 1 / (1 + many * (1 - stay[i]))
     for trial in range(4):
         product(x, r, pad, grid, many)
         for i in range(b.size):
             r[i] = b[i] - r[i]
+        # a product is a difference of numbers that are so many times as large
+        target = max(tolerance**2 * dot(b, b), (rounding * many) ** 2 * dot(inner, inner))
         if trial == 3 or not dot(r, r) > target:
             break
         if symmetric:
-            conjugate_gradients(x, r, pad, grid, many, target, most, spare)
+            conjugate_gradients(x, r, pad, grid, many, inverse, target, most, spare)
         else:
-            bicgstab(x, r, pad, grid, many, target, most, spare)
+            bicgstab(x, r, pad, grid, many, inverse, target, most, spare)
     return dot(r, r) <= 100 * target
 
 
 @kernel(entry=True)
 def solve(
-    begin, end, starts, strides, stay, ups, downs, wrap_to, wrap_from, wraps, many, tolerance,
-    gained, symmetric, most, values, out,
+    begin, end, starts, strides, stay, ups, downs, wrap_to, wrap_from, wraps, many, gained,
+    tolerance, rounding, symmetric, most, values, out,
 ):  # fmt: skip
     """The grids begin … end of one shape after a step of backward Euler, from values to out,
     (voxels,) of all colonies; NaN where the solve did not converge.
 
     strides … wraps: as `transport.mix` takes them. many: λΔt, (b or 1,), 0 where another method
-    carries a colony. tolerance: of the residual over the right-hand side, (b or 1,). gained: Δt ×
-    the gain, (b or 1 or 0, voxels). most: iterations before a restart.
+    carries a colony. tolerance, rounding: as of `backward_euler`. gained: Δt × the gain, (b or 1 or
+    0, voxels). most: iterations before a restart.
     """
     size, pad = stay.shape[1], 0
     for stride in strides:
         pad = max(pad, stride)
     wide = size + 2 * pad
-    mixed, x, spare = np.zeros(wide), np.zeros(wide), np.zeros((5, wide))
+    mixed, x, spare = np.zeros(wide), np.zeros(wide), np.zeros((SPARE, wide))
     b, r = np.empty(size), np.empty(size)
     for c in range(begin, end):
         own = c if stay.shape[0] > 1 else 0
@@ -136,7 +152,9 @@ def solve(
             more = gained[c if gained.shape[0] > 1 else 0]
             for i in range(size):
                 b[i] += more[i]
-        good = backward_euler(x, b, r, pad, grid, many[own], tolerance[own], symmetric, most, spare)
+        good = backward_euler(
+            x, b, r, pad, grid, many[own], tolerance, rounding, symmetric, most, spare
+        )
         for i in range(size):
             # with its residual the change is what T makes of x: amount is conserved, but for the
             # rounding of λΔt exchanges

@@ -10,7 +10,7 @@ import numpy as np
 
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.transport import exchanged
-from torchfilm.kernels.transport_solve import backward_euler, dot, product
+from torchfilm.kernels.transport_solve import SPARE, backward_euler, dot, product
 
 # As in `tools.fixed_point`.
 DEPTH, RIDGE, TINY, WORSE = 3, 1e-12, 1e-300, 4.0
@@ -113,7 +113,7 @@ def room_for(size, strides, events):
     for stride in strides:
         pad = max(pad, stride)
     terms = int(events + 10 * np.sqrt(events) + 31)
-    fields, wider = np.empty((6, size)), np.zeros((7, size + 2 * pad))
+    fields, wider = np.empty((6, size)), np.zeros((2 + SPARE, size + 2 * pad))
     room = (
         fields[0], fields[1], wider[0], fields[2], fields[3], fields[4], fields[5], wider[2:],
         wider[1], np.empty(terms), np.empty(terms),
@@ -133,8 +133,7 @@ def operator_of(c, strides, stay, ups, downs, wrap_to, wrap_from, wraps, rate, s
 
 @kernel
 def with_losses(dt, operator, room, settings):
-    """The greatest rate at which a voxel of a grid loses, with the losses in room; λ; and the
-    operator at this λ, which uses `still` of the room."""
+    """λ, with the losses in room, and the operator at this λ, which uses `still` of the room."""
     strides, stay, ups, downs, wrap_to, wrap_from, wraps, rate, _ = operator
     loss, still, mixed, fastest = room[0], room[1], room[8], 0.0
     for i in range(loss.size):
@@ -145,7 +144,7 @@ def with_losses(dt, operator, room, settings):
     for i in range(loss.size):
         still[i] = 1 - still[i] / at
     grid = strides, still, ups * scale, downs * scale, wrap_to, wrap_from, wraps * scale, mixed
-    return fastest, at, grid
+    return at, grid
 
 
 @kernel
@@ -158,7 +157,7 @@ def carry_once(u, more, dt, pad, operator, room, far, least, settings):
     """
     _, _, x, r, b, final, mean, spare, _, weights, tails = room
     _, cut, events, tolerance, rounding, most = settings
-    fastest, at, grid = with_losses(dt, operator, room, settings)
+    at, grid = with_losses(dt, operator, room, settings)
     times, symmetric = at * dt, operator[8]
     far = far or times > events
     if not far:
@@ -168,8 +167,8 @@ def carry_once(u, more, dt, pad, operator, room, far, least, settings):
     # where cells are hungry at little concentration, an error of it counts, too
     size = np.sqrt(dot(b, b))
     within = min(tolerance, HUNGER * least / size) if size > 0 else tolerance
-    within = max(within, FINEST, rounding * dt * fastest)
-    good = backward_euler(x, b, r, pad, grid, times, within, symmetric, most, spare)
+    within = max(within, FINEST)
+    good = backward_euler(x, b, r, pad, grid, times, within, rounding, symmetric, most, spare)
     for i in range(u.size):
         x[pad + i] = max(x[pad + i], 0.0)
     product(x, r, pad, grid, times)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchfilm.signals.compiled import may_run
 from torchfilm.signals.grid import Shape
 from torchfilm.signals.transport_exponential import Exponential
-from torchfilm.signals.transport_iterative import MAX_ITERATIONS
+from torchfilm.signals.transport_iterative import MAX_ITERATIONS, ROUNDING, TOLERANCE
 from torchfilm.signals.transport_series import Mixing, Series
 from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.threads import Shared
@@ -118,7 +118,8 @@ class CompiledSeries:
         if self.solve is not None:
             from torchfilm.kernels.transport_solve import solve
 
-            given = (*self.arrays[:7], *self.solve, self.symmetric, MAX_ITERATIONS)
+            numbers = TOLERANCE, ROUNDING, self.symmetric, MAX_ITERATIONS
+            given = (*self.arrays[:7], *self.solve, *numbers)
             self._solved(
                 starts.size, lambda begin, end: solve(begin, end, starts, *given, source, target)
             )
@@ -144,7 +145,7 @@ def compiled_series(stepper: Series, shape: Shape) -> CompiledSeries | None:
         more = _no_gain(shape)
         if operator.gain is not None:
             more = (one.dt * operator.gain.detach()).expand(-1, *shape).flatten(1)
-        solve = _packed(many, one.tolerance.expand(count), more)
+        solve = _packed(many, more)
     return CompiledSeries(stepper, shape, arrays, solve, symmetric)
 
 

@@ -107,7 +107,7 @@ class JointTransport:
         rate = wanted / mean.clamp(min=TINY)
         rate = rate.clamp(max=EMPTY / self.dt)
         losses = self._spread(rate)
-        ends, means = [], []
+        ends, means, found = [], [], []
         for k, (one, batch) in enumerate(zip(self.carried, self.grid.batches, strict=True)):
             before = self._far[k]
             end, average, self._far[k] = one.step(
@@ -117,9 +117,12 @@ class JointTransport:
                 self.turned[batch.colonies] |= self._far[k] & ~before
             ends.append(end)
             means.append(average)
+            # backward Euler ends at its mean, but for a residual that may be more than what a cell
+            # finds
+            found.append(torch.where(self._far[k].reshape(-1, 1, 1, 1), average, end))
         end = self.grid.join(ends)
         at_end, average = (
-            torch.where(self.fed, self._read(x), self.found) for x in (end, self.grid.join(means))
+            torch.where(self.fed, self._read(self.grid.join(x)), self.found) for x in (found, means)
         )
         taken = rate * average * (self.stencil.voxel_volume * self.dt)
         return Moved(end, at_end, average, taken)

@@ -23,8 +23,8 @@ from torchfilm.tools.ragged import Groups
 from torchfilm.tools.tangents import both, refuse_second, with_tangent
 
 Map = Callable[[Tensor], Tensor]
-# The residual allowed, relative to the norm of the right-hand side. The solve is in float64, where
-# this is far above rounding; but not where a step has very many exchanges, which are rounded.
+# The residual allowed, relative to the norm of the right-hand side; and for each exchange of a
+# voxel in a step, relative to that of the solution, since these are rounded.
 TOLERANCE = 1e-10
 ROUNDING = 1e-15
 MAX_ITERATIONS = 2000
@@ -74,7 +74,8 @@ class Unsplit:
     """u ↦ (I − θΔt T)⁻¹ [(I + (1 − θ)Δt T) u + Δt gain], each colony converged by itself.
 
     θ: 1 for backward Euler, 1/2 for Crank–Nicolson. The solve uses conjugate gradients, or BiCGStab
-    where there is flow.
+    where there is flow, scaled by the diagonal: cells may take from a few voxels a million times
+    what is there.
     """
 
     operator: Operator
@@ -82,10 +83,14 @@ class Unsplit:
     theta: float
 
     @cached_property
-    def tolerance(self) -> Tensor:
-        """Of the residual, relative to the right-hand side, (B or 1,)."""
-        exchanges = self.dt * self.operator.loss.detach().flatten(1).amax(1)
-        return (ROUNDING * exchanges).clamp(min=TOLERANCE)
+    def inverse(self) -> Tensor:
+        """Of the diagonal of I − θΔt T, (B or 1, nx, ny, nz)."""
+        return 1 / (1 + self.theta * self.dt * both(self.operator.loss.detach())[0].double())
+
+    @cached_property
+    def rounding(self) -> Tensor:
+        """Of the residual, relative to the solution, (B or 1,)."""
+        return ROUNDING * self.dt * both(self.operator.loss.detach())[0].flatten(1).amax(1)
 
     def step(self, u: Tensor) -> Tensor:
         """u (B, nx, ny, nz) one step later; NaN in a colony whose solve did not converge."""
@@ -118,7 +123,7 @@ class Unsplit:
             bare = lambda x: both(x)[0]
             still = lambda x: bare(left(x))
             solved = lambda b, first: krylov(
-                still, b, first, self.operator.symmetric, self.tolerance
+                still, b, first, self.operator.symmetric, self.rounding, self.inverse
             )
             x, report = solved(bare(right), bare(wide))
             x = x.clamp(min=0.0) if self.theta == 1 else x
@@ -160,8 +165,8 @@ class _KrylovAdjoint(torch.autograd.Function):
                 return torch.autograd.grad(value, at, x, retain_graph=True)[0]
 
         with torch.no_grad():
-            first, tolerance = torch.zeros_like(grad), ctx.of.tolerance
-            found, report = krylov(left, grad, first, symmetric, tolerance)
+            first, of = torch.zeros_like(grad), ctx.of
+            found, report = krylov(left, grad, first, symmetric, of.rounding, of.inverse)
         return (
             torch.where(report.converged.reshape(-1, 1, 1, 1), found, torch.nan),
             None,
@@ -198,61 +203,69 @@ def _ratio(a: Tensor, b: Tensor) -> Tensor:
 
 
 def krylov(
-    apply: Map, b: Tensor, start: Tensor, symmetric: bool, tolerance: Tensor
+    apply: Map, b: Tensor, start: Tensor, symmetric: bool, rounding: Tensor, inverse: Tensor
 ) -> tuple[Tensor, TransportSolveReport]:
     """Solve A x = b, (B, nx, ny, nz), in float64, one system per colony, each until it converges.
 
-    tolerance: of the residual, relative to b, (B or 1,). No gradient.
+    The residual is at most TOLERANCE of b, or its `rounding` (B or 1,) of x. inverse: of the
+    diagonal of A. No gradient.
     """
     size = _dot(b, b)
-    target = tolerance.reshape(-1, 1, 1, 1) ** 2 * size
+    least = rounding.reshape(-1, 1, 1, 1) ** 2
     x, iterations = start.clone(), torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
     # restarts from the true residual correct the rounding errors of the recurred one
     for _ in range(3):
         r = b - apply(x)
+        target = torch.maximum(TOLERANCE**2 * size, least * _dot(x, x))
         going = _dot(r, r) > target
         if not bool(going.any()):
             break
-        x, spent = (_conjugate_gradients if symmetric else _bicgstab)(apply, x, r, going, target)
+        method = _conjugate_gradients if symmetric else _bicgstab
+        x, spent = method(apply, x, r, inverse, going, target)
         iterations += spent
     r = b - apply(x)
+    target = torch.maximum(TOLERANCE**2 * size, least * _dot(x, x))
     residual = _ratio(_dot(r, r), size).sqrt().reshape(-1)
     # a right-hand side of zero has the solution zero; a NaN never converges
     return x, TransportSolveReport(iterations, residual, (_dot(r, r) <= 100 * target).reshape(-1))
 
 
 def _conjugate_gradients(
-    apply: Map, x: Tensor, r: Tensor, going: Tensor, target: Tensor
+    apply: Map, x: Tensor, r: Tensor, inverse: Tensor, going: Tensor, target: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Returns x and the iterations of each colony, (B,)."""
     spent = torch.zeros(x.shape[0], dtype=torch.int64, device=x.device)
-    p, rr = r, _dot(r, r)
+    p = inverse * r
+    rz = _dot(p, r)
     for _ in range(MAX_ITERATIONS):
         q = apply(p)
-        alpha = torch.where(going, _ratio(rr, _dot(p, q)), 0.0)
+        alpha = torch.where(going, _ratio(rz, _dot(p, q)), 0.0)
         x, r = torch.addcmul(x, alpha, p), torch.addcmul(r, alpha, q, value=-1.0)
         spent += going.reshape(-1)
-        new = _dot(r, r)
-        going = going & (new > target)
+        going = going & (_dot(r, r) > target)
         if not bool(going.any()):
             break
-        p, rr = torch.addcmul(r, torch.where(going, _ratio(new, rr), 0.0), p), new
+        z = inverse * r
+        new = _dot(z, r)
+        p, rz = torch.addcmul(z, torch.where(going, _ratio(new, rz), 0.0), p), new
     return x, spent
 
 
 def _bicgstab(
-    apply: Map, x: Tensor, r: Tensor, going: Tensor, target: Tensor
+    apply: Map, x: Tensor, r: Tensor, inverse: Tensor, going: Tensor, target: Tensor
 ) -> tuple[Tensor, Tensor]:
     """van der Vorst's stabilised bi-conjugate gradients; returns as `_conjugate_gradients`."""
     spent = torch.zeros(x.shape[0], dtype=torch.int64, device=x.device)
     shadow, p, rho = r, r, _dot(r, r)
     for _ in range(MAX_ITERATIONS):
-        v = apply(p)
+        scaled = inverse * p
+        v = apply(scaled)
         alpha = torch.where(going, _ratio(rho, _dot(shadow, v)), 0.0)
-        s = torch.addcmul(r, alpha, v, value=-1.0)
-        t = apply(s)
+        x, s = torch.addcmul(x, alpha, scaled), torch.addcmul(r, alpha, v, value=-1.0)
+        scaled = inverse * s
+        t = apply(scaled)
         omega = torch.where(going, _ratio(_dot(t, s), _dot(t, t)), 0.0)
-        x = torch.addcmul(torch.addcmul(x, alpha, p), omega, s)
+        x = torch.addcmul(x, omega, scaled)
         r = torch.where(going, torch.addcmul(s, omega, t, value=-1.0), r)
         spent += going.reshape(-1)
         going = going & (_dot(r, r) > target)
