@@ -261,21 +261,23 @@ class State:
                 sorted(values.keys() - self.declared.keys()),
                 f"declared; known are {', '.join(self.declared) or 'none'}",
             )
-        row_checks.check_tensors(values)
+        row_checks.check_tensors(values, self.fields, self._shape_of)
         return self.replace(fields={**self.fields, **values})
 
+    @property
+    def _rows(self) -> dict[str, int]:
+        """How many rows a field of each scope has."""
+        nodes = 0 if self.layout is None else self.layout.grid.nodes
+        return {CELL: self.cells, COLONY: self.colonies, GRID: nodes}
+
+    def _shape_of(self, name: str) -> tuple[int, ...]:
+        return (self._rows[self.declared[name].scope], *self.declared[name].shape)
+
     def check_fields(self) -> None:
-        """Raise InputError for a field that has not one value per cell, or per colony."""
-        rows = {CELL: self.cells, COLONY: self.colonies}
-        for name, value in self.fields.items():
-            scope = self.declared[name].scope
-            if scope in rows and (not value.dim() or value.size(0) != rows[scope]):
-                raise checks.input_error(
-                    f"shape of the field {name!r}",
-                    tuple(value.shape),
-                    f"one value for each {scope} first; the state has {self.cells} cells in"
-                    f" {self.colonies} colonies",
-                )
+        """Raise InputError for a field of another number of rows, and for a signal below 0."""
+        scopes = {n: self.declared[n].scope for n in self.fields}
+        signals = [n for n in self.fields if n.startswith(OUTSIDE)]
+        row_checks.check_fields(self.fields, scopes, self._rows, signals)
 
     def declare(self, field: Field) -> State:
         """A state that has one more field, at its initial value."""
@@ -287,8 +289,7 @@ class State:
                 f"the field {field.name!r} needs a grid, and this state has none: list a Medium in"
                 " the scene."
             )
-        nodes = 0 if self.layout is None else self.layout.grid.nodes
-        rows = {CELL: self.cells, COLONY: self.colonies, GRID: nodes}[field.scope]
+        rows = self._rows[field.scope]
         start = field.start(declared, torch.arange(rows, device=self.device))
         if start.shape[0] != rows:
             raise checks.input_error(

@@ -134,3 +134,37 @@ def test_the_stencil_knows_height_mask_and_period(dtype):
         position, colony, dtype
     )
     assert held.outside.tolist() == [False, True, True]
+
+
+def test_a_state_on_another_grid_is_not_continued_silently():
+    """Its signals would stay on the grid that they were begun on."""
+
+    def scene(spacing=4.0, box=40.0, depth=1.0):
+        medium = tf.Medium(
+            food=tf.Signal(10.0, initial=1.0), box=((-box, -box), (box, box)), spacing=spacing,
+            depth=depth,
+        )  # fmt: skip
+        return tf.Scene(tf.Monod("food"), tf.Growth(), medium, dim=2)
+
+    state = scene().bind().start()
+    for given in ({"spacing": 8.0}, {"box": 80.0}, {"depth": 10.0}):
+        with pytest.raises(tf.InputError, match="on another grid, of 4 × 4 × 1 µm"):
+            list(tf.simulate(scene(**given), state, until=0.1))
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        (torch.ones(10), r"shape of the field 'out.food' = \(10,\).*\(400,\)"),
+        (torch.ones(20, 20), r"shape of the field 'out.food' = \(20, 20\)"),
+        (torch.ones(400, dtype=torch.int64), "type of the field 'out.food'"),
+        (torch.full((400,), -1.0), "'out.food', a signal.*0 or more everywhere"),
+        (torch.full((400,), torch.nan), "'out.food', a signal.*0 or more everywhere"),
+    ],
+)
+def test_a_signal_that_cannot_be_is_refused(values, words):
+    medium = tf.Medium(food=tf.Signal(10.0, initial=1.0), box=((-40, -40), (40, 40)), spacing=4.0)
+    scene = tf.Scene(tf.Monod("food"), tf.Growth(), medium, dim=2)
+    state = scene.bind().start()
+    with pytest.raises(tf.InputError, match=words):
+        list(tf.simulate(scene, state.with_fields(**{"out.food": values}), until=0.1))

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+from weakref import ref
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ from torchfilm.effect import (
 )  # fmt: skip
 from torchfilm.effects.medium_transport import Transport
 from torchfilm.signals.exchange import spans
+from torchfilm.signals.grid import Grid
 from torchfilm.signals.space import MOST_VOXELS
 from torchfilm.state import GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
@@ -207,6 +209,7 @@ class GridCoverage(_MediumPart):
         flat = [round((b - a) / h) == 1 for a, b, h in zip(corner, end, size, strict=True)]
         fixed = [letter not in effect.grows for letter in "xyz"]
         self.flat, self.fixed = torch.tensor([flat, fixed], device=binding.batch.device)
+        self._seen: ref[Grid] | None = None  # the grid that was checked last
 
     def reads(self) -> tuple[str, ...]:
         return ("position", *self.writes())
@@ -221,6 +224,10 @@ class GridCoverage(_MediumPart):
         return self._grown(state) if self.effect.outside == "grow" else state
 
     def opened(self, state: State) -> State:
+        layout = state.layout
+        if layout is not None and (self._seen is None or self._seen() is not layout.grid):
+            self._check_grid(state)
+            self._seen = ref(layout.grid)
         return self.transport.opened(state)
 
     def check(self, state: State) -> None:
@@ -232,6 +239,25 @@ class GridCoverage(_MediumPart):
             raise checks.InputError(
                 f"Medium.box, from {low} to {high} µm, is too small for colony {colony}:"
                 f" {report.reason(place)}. {report.hint}."
+            )
+
+    def _check_grid(self, state: State) -> None:
+        """Raise InputError for a state whose signals are on another grid than this medium's."""
+        if state.layout is None:
+            return
+        grid, (low, high, step) = state.layout.grid, self.effect.corners
+        same = tuple(grid.spacing) == tuple(step)
+        if same and self.effect.outside != "grow":
+            count = [round((b - a) / h) for a, b, h in zip(low, high, step, strict=True)]
+            same = all(shape == tuple(count) for shape in grid.shapes) and bool(
+                (grid.origin == grid.origin.new_tensor(low)).all()
+            )
+        if not same:
+            raise checks.InputError(
+                f"Medium has voxels of {' × '.join(f'{h:g}' for h in step)} µm in the box {low} to"
+                f" {high}, but the signals of this state are on another grid, of"
+                f" {' × '.join(f'{h:g}' for h in grid.spacing)} µm: give the box, spacing and depth"
+                " that it was begun with."
             )
 
     def step(self, state: State, dt: float) -> State:

@@ -3,7 +3,7 @@ colonies."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -103,12 +103,43 @@ def check_geometry(columns: Mapping[str, Tensor], colonies: int, dim: int, dtype
             raise checks.input_error(f"state.{name}[{k}]", columns[name][k].item(), rule)
 
 
-def check_tensors(values: Mapping[str, Any]) -> None:
-    """Raises InputError for a field's new values that are no tensor."""
+def check_tensors(
+    values: Mapping[str, Any], present: Mapping[str, Tensor], shape: Callable[[str], Sequence[int]]
+) -> None:
+    """Raises InputError for a field's new values that are no tensor, or not of the shape and kind
+    of those that are present. shape: that a field should have; it is asked where it has changed."""
     for name, value in values.items():
         if not isinstance(value, Tensor):
-            rule = "a tensor with a row for each cell, or colony"
+            rule = "a tensor with a row for each cell, colony or voxel"
             raise checks.input_error(f"the field {name!r}", value, rule)
+        now = present.get(name)
+        if now is None or (value.shape == now.shape and value.dtype == now.dtype):
+            continue
+        if value.shape != now.shape and tuple(value.shape) != (wanted := tuple(shape(name))):
+            rule = f"{wanted}, one value for each cell, colony or voxel first"
+            raise checks.input_error(f"shape of the field {name!r}", tuple(value.shape), rule)
+        if value.is_floating_point() != now.is_floating_point():
+            raise checks.input_error(f"type of the field {name!r}", value.dtype, f"{now.dtype}")
+
+
+def check_fields(
+    fields: Mapping[str, Tensor], scopes: Mapping[str, str], rows: Mapping[str, int],
+    signals: Collection[str],
+) -> None:  # fmt: skip
+    """Raises InputError for a field that has not as many rows as its scope, and for one of
+    `signals` that is below 0, or no number, in some voxel."""
+    for name, value in fields.items():
+        scope = scopes[name]
+        if not value.dim() or value.size(0) != rows[scope]:
+            raise checks.input_error(
+                f"shape of the field {name!r}",
+                tuple(value.shape),
+                f"one value for each {'voxel' if scope == 'grid' else scope} first; the state has"
+                f" {rows['cell']} cells in {rows['colony']} colonies",
+            )
+        if name in signals and bool((wrong := ~(value >= 0)).any()):
+            bad = float(value[wrong][0])
+            raise checks.input_error(f"the field {name!r}, a signal,", bad, "0 or more everywhere")
 
 
 def _rule(count: int) -> str:
