@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
+from design.quiet import ALONE, alone_and_quiet
 
 EDGE = 1e-6  # coordinates this close to a bound count as so close
 FARTHEST = 10.0  # standard deviations: statistics farther off count as so far
@@ -74,7 +75,7 @@ class NeuralPosterior:
         centre, scale = (torch.tensor(v[used]) for v in (statistics.mean(0), spread))
         learner = NeuralPosterior((), centre, scale, used)
         theta, x = _logit(torch.as_tensor(points)).float(), learner._inputs(statistics)
-        with torch.random.fork_rng(devices=[]):
+        with ALONE, torch.random.fork_rng(devices=[]):
             return NeuralPosterior(
                 _learn_flows(theta, x, seed, flows, epochs, begun), centre, scale, used
             )
@@ -92,7 +93,7 @@ class NeuralPosterior:
         rows = max(1, SAMPLES_AT_ONCE // count)
         shares = [count * (k + 1) // len(self.flows) - count * k // len(self.flows)
                   for k in range(len(self.flows))]  # fmt: skip
-        with torch.random.fork_rng(devices=[]):
+        with ALONE, torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             parts = [
                 torch.cat([flow.sample((share,), condition=some)
@@ -140,8 +141,7 @@ class _NoTracker:
 def _learn_flow(theta: Tensor, x: Tensor, seed: int, epochs: int) -> Any:
     """One flow, from its own start and division of the data."""
     # sbi warns of its own imports, and prints when it has converged
-    with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")
+    with alone_and_quiet(), redirect_stdout(io.StringIO()):
         from sbi.inference import NPE
 
         torch.manual_seed(seed)

@@ -133,15 +133,28 @@ def read_design(path: Path) -> dict[str, Any]:
         found = json.loads(path.read_text())
         if not isinstance(found, dict) or not isinstance(found["parameters"], dict):
             raise TypeError("its parameters are no table")
+        _check_content(found)
     except OSError as error:
         why = error.strerror or error
         raise tf.InputError(f"{path} cannot be read as a saved design: {why}.") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise tf.InputError(
             f"{path} cannot be read as a saved design, which Best.save writes"
             f" ({type(error).__name__}: {error})."
         ) from error
     return found
+
+
+def _check_content(found: Mapping[str, Any]) -> None:
+    """Raise TypeError or KeyError for what no design has."""
+    if not isinstance(found.get("loss", 0.0), (int, float)):
+        raise TypeError("its loss is no number")
+    search = found.get("search", {"names": []})
+    if not isinstance(search, dict) or not isinstance(search["names"], list):
+        raise TypeError("its search is no table with names")
+    for name in search["names"]:
+        if name not in found["parameters"]:
+            raise KeyError(f"{name!r}, of the search, is not among its parameters")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -166,12 +179,12 @@ class SavedDesign:
     @property
     def loss(self) -> float:
         """As when it was saved: on fresh seeds, or else in the search."""
-        return float(self.content["loss"])
+        return float(self._held("loss"))
 
     @property
     def losses(self) -> np.ndarray:
         """Of each fresh seed (S,), or of each replicate in the search (R,)."""
-        return np.array(self.content["losses"])
+        return np.array(self._held("losses"))
 
     @property
     def values(self) -> dict[str, Value]:
@@ -195,8 +208,9 @@ class SavedDesign:
     @property
     def dtype(self) -> torch.dtype:
         """In which it was searched."""
-        checks.choice(f"dtype in {self.path}", self.content["dtype"], tuple(DTYPES))
-        return DTYPES[self.content["dtype"]]
+        name = self._held("dtype")
+        checks.choice(f"dtype in {self.path}", name, tuple(DTYPES))
+        return DTYPES[name]
 
     @cached_property
     def objective(self) -> Objective:
@@ -234,6 +248,11 @@ class SavedDesign:
                 " can be grown; for a check run the search again and save its best design."
             )
         return self.content["search"]
+
+    def _held(self, name: str) -> Any:
+        if name not in self.content:
+            raise tf.InputError(f"{self.path} does not hold the {name} that Best.save writes.")
+        return self.content[name]
 
     def _part(self, name: str, given: Any) -> Any:
         if given is not None:

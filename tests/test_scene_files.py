@@ -108,14 +108,17 @@ def test_a_design_of_one_colony_starts_as_the_ready_scene_does(folder):
         ({"scene": "microcolony", "parameters": [1]}, "is no saved design"),
         ({"scene": 5, "parameters": {}}, "is no saved design"),
         ({**READY, "scene": "microcolonie"}, "scene = 'microcolonie'.*one of microcolony"),
-        ({**READY, "scene": "none.py"}, "scene = 'none.py'.*No such file"),
+        ({**READY, "scene": "none.py"}, "scene in .* = 'none.py'.*the name of a ready scene"),
+        ({**READY, "file": "/elsewhere/up.py"}, "'/elsewhere/up.py'.*below the current folder"),
+        ({**READY, "file": "../up.py"}, "'../up.py'.*below the current folder.*would be run"),
+        ("[" * 100_000, "cannot be read as JSON"),
         (
             {**READY, "scene": "best.json"},
-            "scene in .*best.json = 'best.json'.*a ready scene, or the path of a Python file",
+            "scene in .*best.json = 'best.json'.*the name of a ready scene",
         ),
         (
             {**READY, "file": "other.json"},
-            "'other.json'.*a ready scene, or the path of a Python file",
+            "file in .*best.json = 'other.json'.*the path of a Python file",
         ),
         (
             {**READY, "parameters": {"rates": 1.0}},

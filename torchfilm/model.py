@@ -32,7 +32,7 @@ from torchfilm.tools import checks, displays
 from torchfilm.tools.hashing import digest
 from torchfilm.tools.row_checks import check_declared, check_geometry
 from torchfilm.tools.tangents import tracked
-from torchfilm.tools.threads import one_torch_thread
+from torchfilm.tools.threads import after_fork, one_torch_thread
 from torchfilm.tools.times import later
 from torchfilm.tools.timing import Timings
 from torchfilm.tools.warn_once import once
@@ -353,6 +353,7 @@ def bind(
 ) -> Model:
     """As `Scene.bind`. only: bind only the effects at these places of the scene. check_first:
     check whether the first cells may be where they are; not needed where a file replaces them."""
+    after_fork()
     if state is not None:
         return _bind_to_state(scene, state, only)
     founders = cells if cells is not None else scene.founders

@@ -28,6 +28,7 @@ from torchfilm.scene import Scene
 from torchfilm.state import State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.progress import RunBar, wanted
+from torchfilm.tools.threads import after_fork
 from torchfilm.tools.timing import Timings
 
 if TYPE_CHECKING:
@@ -70,6 +71,7 @@ def simulate(
     only. on_failure: "raise" a SimulationError that names the colonies that failed (a solve that
     did not converge, a cell too short to divide), or "drop" their cells, note it, and continue.
     """
+    after_fork()
     _check_kinds("simulate", scene, state)
     dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
     observers = (observers,) if callable(observers) else tuple(observers)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from importlib.util import find_spec
 
@@ -10,6 +9,7 @@ import numpy as np
 import torch
 
 from design.methods.base import AskTell, Batch, numpy_kept, snap, sobol_points
+from design.quiet import alone_and_quiet
 from torchfilm import checks, one_torch_thread
 
 # The optimisation of the acquisition starts from the best few of many samples, and takes so many
@@ -118,12 +118,11 @@ class Bayesian(AskTell):
         generators."""
         key = [self._seed, len(loss)]
         with (
-            warnings.catch_warnings(),
+            alone_and_quiet(),
             one_torch_thread(),  # matrices are small: another one would only wait
             torch.random.fork_rng(devices=[]),
             numpy_kept(key),
         ):
-            warnings.simplefilter("ignore")
             # only this generator: torch.manual_seed would change those of the devices too
             torch.default_generator.manual_seed(
                 int(np.random.SeedSequence(key).generate_state(1)[0])

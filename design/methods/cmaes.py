@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from design.methods.base import AskTell, Batch, numpy_kept, snap, sobol_points
+from design.quiet import alone_and_quiet
 from torchfilm import checks
 
 # A restart doubles the population, up to this many times the first: the batch must fit the machine.
@@ -161,6 +161,5 @@ class CMAES(AskTell):
     def _quiet(self) -> Iterator[None]:
         """For calls of cma: it warns of cases that are handled here, and draws from numpy's global
         generator in an assertion of its centring."""
-        with warnings.catch_warnings(), numpy_kept([self._seed, self._draws]):
-            warnings.simplefilter("ignore")
+        with alone_and_quiet(), numpy_kept([self._seed, self._draws]):
             yield

@@ -121,6 +121,13 @@ FOREIGN = {
     "parameters alone": ('{"parameters": {}}', r"names no scene"),
     "no parameters": ('{"scene": "a", "parameters": 3}', r"its parameters are no table"),
     "an unknown scene": ('{"scene": "a", "parameters": {}}', r"scene = 'a'"),
+    "depth": ("[" * 100_000, "RecursionError"),
+    "another loss": ('{"scene": "a", "parameters": {}, "loss": "x"}', "loss is no number"),
+    "a list as search": ('{"scene": "a", "parameters": {}, "search": []}', "no table with names"),
+    "foreign names": (
+        '{"scene": "a", "parameters": {}, "search": {"names": ["nope"]}}',
+        "'nope'.*not among",
+    ),
 }
 
 
@@ -130,6 +137,14 @@ def test_foreign_files_are_refused(tmp_path, kind):
     (tmp_path / "file.json").write_text(text)
     with pytest.raises(tf.InputError, match=message):
         load_design(tmp_path / "file.json")
+
+
+def test_what_a_file_does_not_hold_is_named(tmp_path):
+    (tmp_path / "file.json").write_text('{"scene": "microcolony", "parameters": {}}')
+    design = load_design(tmp_path / "file.json")
+    for name in ("loss", "losses", "dtype"):
+        with pytest.raises(tf.InputError, match=f"does not hold the {name} that"):
+            getattr(design, name)
 
 
 def test_what_is_missing_is_named(saved, tmp_path):

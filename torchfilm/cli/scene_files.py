@@ -90,15 +90,31 @@ def _hint(path: Path) -> str:
 
 def _scene_of_design(what: str, parameters: dict[str, Any]) -> Scene:
     plan = design(what)
-    home = str(plan.get("file") or plan["scene"])
-    if Path(home).suffix.lower() == ".json":
-        raise checks.input_error(
-            f"scene in {what}", home, "the name of a ready scene, or the path of a Python file"
-        )
+    file, home = plan.get("file"), plan["scene"]
+    if file is not None:
+        home = _own_file(what, file)
+    elif not home.isidentifier():
+        raise checks.input_error(f"scene in {what}", home, "the name of a ready scene")
     made = load_scene(
         home, {**plan["parameters"], **parameters}, str(plan.get("function") or "scene")
     )
     return made.replace(dt=checks.number(f"dt in {what}", plan.get("dt", made.dt), above=0.0))
+
+
+def _own_file(what: str, file: Any) -> str:
+    """The Python file that a saved design names. Raises InputError for one that is not below the
+    current folder: a design may come from elsewhere, and must not run any file of this machine."""
+    here = Path.cwd().resolve()
+    if not isinstance(file, str) or Path(file).suffix.lower() != ".py":
+        raise checks.input_error(f"file in {what}", file, "the path of a Python file")
+    if not Path(file).resolve().is_relative_to(here):
+        raise checks.input_error(
+            f"file in {what}",
+            file,
+            f"below the current folder, {here}",
+            "It would be run: if you trust it, change to its folder first.",
+        )
+    return file
 
 
 def _run_scene_file(path: Path, what: str) -> dict[str, Any]:
@@ -139,7 +155,7 @@ def design(what: str) -> dict[str, Any]:
         raise checks.input_error("scene", what, "the path of a saved design", "No such file.")
     try:
         content = json.loads(path.read_text())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{what} cannot be read as JSON: {error}.") from error
     if (
         not isinstance(content, dict)

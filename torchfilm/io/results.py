@@ -62,6 +62,10 @@ class Results(metaclass=checks.KnownKeywords):
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file, as leaving `with` does; again does nothing."""
         self.file.close()
 
     def __len__(self) -> int:

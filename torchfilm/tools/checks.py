@@ -123,6 +123,17 @@ def check_call(
         ) from None
 
 
+def default_device() -> None:
+    """Raise InputError where torch makes tensors elsewhere by default: numbers that describe a
+    scene would get there."""
+    if torch.get_default_device().type != "cpu":
+        raise InputError(
+            f"torch's default device is {torch.get_default_device()}: leave it at the CPU"
+            " (torch.set_default_device('cpu')), and say where colonies are to be computed, such as"
+            " tf.simulate(…, device='cuda')."
+        )
+
+
 class KnownKeywords(abc.ABCMeta):
     """The metaclass of classes that raise InputError, with the nearest name, for a keyword that
     they do not take, and for an argument that is missing. (One of abstract classes, so that a
@@ -137,6 +148,7 @@ class KnownKeywords(abc.ABCMeta):
 
     def __call__(cls, *args: Any, **given: Any) -> Any:
         check_call(cls.__name__, cls._known(), args, given, cls.instead, cls.unnamed)
+        default_device()
         return super().__call__(*args, **given)
 
     def _known(cls) -> inspect.Signature:

@@ -16,11 +16,42 @@ import numpy as np
 import torch
 
 from torchfilm.tools import subnormals
+from torchfilm.tools.warn_once import warn
 
 # Seconds of work for which a thread is worth waking: until it begins it takes 0.05 to 0.3 ms. At
 # 0.3 ms a step of circuits in 64 × 100 cells takes 0.64 ms on two threads, at 0.4 ms one thread did
 # it in 0.88; smaller batches and single colonies took as long with either, and longer below 0.2 ms.
 WORTH_WAKING = 3e-4
+
+
+class _Forked:
+    """Whether this process is a fork: the threads of its parent are gone, and torch would wait for
+    its own for ever."""
+
+    here = False
+
+    def note(self) -> None:
+        self.here = True
+
+
+_forked = _Forked()
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_forked.note)
+
+
+def after_fork() -> None:
+    """In a fork torch gets one thread, and a warning says so."""
+    if not _forked.here:
+        return
+    _forked.here = False
+    if available() > 1:
+        torch.set_num_threads(1)
+        _given.count = None
+        warn(
+            "this process was forked, without the threads of torch, for which it would wait for"
+            " ever: torch computes in one thread here. Start processes by"
+            " multiprocessing.get_context('spawn')."
+        )
 
 
 class _Given(threading.local):
