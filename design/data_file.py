@@ -15,6 +15,7 @@ import torch
 
 import torchfilm as tf
 from design.parameters import Value
+from torchfilm import checks
 
 SPARE_BYTES = 1 << 18  # of a file that grows by a generation
 
@@ -88,10 +89,11 @@ def reading(path: Path, form: str, version: int, what: str) -> Iterator[h5py.Fil
                     f"{path} has format version {file.attrs['version']}; this torchfilm reads"
                     f" versions up to {version}. Update torchfilm."
                 )
+            checks.only_own_data(file)
             yield file
     except tf.InputError:
         raise
-    except (OSError, KeyError, ValueError, TypeError) as error:
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError, IndexError) as error:
         raise tf.InputError(
             f"{path} cannot be read: it is truncated or not a {what} ({error})."
         ) from error

@@ -185,7 +185,10 @@ class Lineage:
         wanted = _pair(self.colony, self.parent)
         at = np.searchsorted(self._keys, wanted).clip(max=len(self._keys) - 1)
         known = (self.parent >= 0) & (self._keys[at] == wanted)
-        return np.where(known, self._order[at], -1)
+        found = np.where(known, self._order[at], -1)
+        if (found >= np.arange(len(found))).any():
+            raise InputError(f"{self._path} is damaged: a cell descends from a later one.")
+        return found
 
     @cached_property
     def _daughters(self) -> dict[int, list[int]]:

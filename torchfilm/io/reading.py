@@ -3,6 +3,7 @@ killed run left."""
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,7 +26,9 @@ def blaming_file(file: h5py.File, name: str) -> Iterator[None]:
     """Raise InputError, which names the damaged dataset, for any failure of HDF5 inside."""
     try:
         yield
-    except (OSError, KeyError, RuntimeError) as error:
+    except InputError:
+        raise
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError, IndexError) as error:
         raise InputError(
             f"{file.filename} is damaged: its {name!r} cannot be read ({error}). Use another copy"
             " of it, or other frames."
@@ -38,6 +41,13 @@ def read_dataset(file: h5py.File, name: str, at: int | slice | EllipsisType = ..
         raise InputError("the results file is closed: read inside `with tf.Results(…) as results:`")
     with blaming_file(file, name):
         return file[name][at]
+
+
+def read_attribute(file: h5py.File, name: str, missing: str | None = None) -> Any:
+    """What an attribute holds as JSON, or `missing` does. Raises InputError if it cannot be
+    read."""
+    with blaming_file(file, name):
+        return json.loads(file.attrs[name] if missing is None else file.attrs.get(name, missing))
 
 
 def frame_count(file: h5py.File) -> int:
@@ -86,11 +96,15 @@ def open_results(path: Path) -> h5py.File:
                 f"{path} is not a torchfilm results file (its format is"
                 f" {file.attrs.get('format')!r})."
             )
-        if int(file.attrs["version"]) > VERSION:
+        with blaming_file(file, "version"):
+            version = int(file.attrs["version"])
+        if version > VERSION:
             raise InputError(
-                f"{path} has format version {file.attrs['version']}, newer than this torchfilm"
+                f"{path} has format version {version}, newer than this torchfilm"
                 f" reads ({VERSION}). Update torchfilm."
             )
+        with blaming_file(file, "/"):
+            checks.only_own_data(file)
         if frame_count(file) == 0:
             raise InputError(f"{path} holds no finished frame.")
     except InputError:

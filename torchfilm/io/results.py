@@ -3,7 +3,6 @@ and a run resumes from it bit for bit. `torchfilm.io.layout` describes the file.
 
 from __future__ import annotations
 
-import json
 import operator
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -25,6 +24,7 @@ from torchfilm.io.reading import (
     frame_count,
     inode_of_open,
     open_results,
+    read_attribute,
     read_dataset,
 )
 from torchfilm.io.restoring import restore_state
@@ -137,32 +137,32 @@ class Results(metaclass=checks.KnownKeywords):
     @property
     def recipe(self) -> tuple[str, dict[str, Any]] | None:
         """Name and parameters of the ready-made scene; None for a scene of the user's own."""
-        found = json.loads(self.file.attrs["recipe"])
+        found = read_attribute(self.file, "recipe")
         return None if found is None else (found[0], found[1])
 
     @property
     def settings(self) -> dict[str, Any]:
         """The parameters given to a scene function of the user's own."""
-        return json.loads(self.file.attrs["settings"])
+        return read_attribute(self.file, "settings")
 
     @property
     def accuracy(self) -> dict[str, float]:
         """The knobs of accuracy given to the scene beside its own (`torchfilm.Settings`)."""
-        return json.loads(self.file.attrs.get("accuracy", "{}"))
+        return read_attribute(self.file, "accuracy", "{}")
 
     @property
     def walls(self) -> list[dict[str, Any]]:
         """The surfaces that cells could not pass. A flat one has "normal" and "offset" (normal · x
         on it, µm), a round one "center" and "radius", µm. Each entry is one number, or a list of
         one per colony. "soft" says whether the surface yields."""
-        return json.loads(self.file.attrs.get("walls", "[]"))
+        return read_attribute(self.file, "walls", "[]")
 
     @property
     def internal_fields(self) -> set[str]:
         """The fields that serve the numerics: `table` shows them only with `internals`."""
         given = self.file.attrs.get("internal")
         if given is not None:
-            return set(json.loads(given))
+            return set(read_attribute(self.file, "internal"))
         names = declared_fields(self.file.attrs)
         return {n for n in names if n in INTERNAL_BEFORE or n.endswith(INTERNAL_ENDING_BEFORE)}
 
@@ -238,8 +238,11 @@ class Results(metaclass=checks.KnownKeywords):
 
     def _rows(self, k: int) -> slice:
         """The rows of a frame's cells."""
-        start = int(self._read("frames/first_row", k))
-        return slice(start, start + int(self._read("frames/counts", k).sum()))
+        start, counts = int(self._read("frames/first_row", k)), self._read("frames/counts", k)
+        rows = slice(start, start + int(counts.sum()))
+        if (counts < 0).any() or not 0 <= start <= rows.stop <= len(self.file["cells/uid"]):
+            raise InputError(f"{self.path} is damaged: frame {k} has {rows.stop - start} cells.")
+        return rows
 
     def next_uid(self, frame: int = -1) -> np.ndarray:
         """(B,) the uid that the next cell born in each colony gets."""

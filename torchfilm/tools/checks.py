@@ -123,6 +123,28 @@ def check_call(
         ) from None
 
 
+def only_own_data(file: Any) -> None:
+    """Raise InputError for an open HDF5 file with parts that lie elsewhere: links, and datasets
+    with data in other files. A file from elsewhere could show what it should not."""
+    import h5py  # most scripts do without it
+
+    groups = [file]
+    for group in groups:
+        for name in group:
+            part = f"{group.name.rstrip('/')}/{name}"
+            own = isinstance(group.get(name, getlink=True), h5py.HardLink)
+            item = group[name] if own else None
+            if isinstance(item, h5py.Dataset):
+                own = not (item.is_virtual or item.external)
+            elif item is not None:
+                groups.append(item)
+            if not own or len(groups) > 1000:
+                raise InputError(
+                    f"{file.filename} is not read: its {part!r} lies in another place. Files of"
+                    " torchfilm hold all their data themselves."
+                )
+
+
 def default_device() -> None:
     """Raise InputError where torch makes tensors elsewhere by default: numbers that describe a
     scene would get there."""
