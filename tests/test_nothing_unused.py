@@ -64,12 +64,19 @@ def test_a_signal_that_stays_0_is_warned_of_at_the_users_line():
         {"source": lambda places: places[:, 0].abs()},
         {"reservoir": 1.0, "outside": "reservoir"},
         {"boundary": tf.BoundaryConditions(x=tf.Dirichlet(1.0))},
-        {"boundary": tf.BoundaryConditions(y=(tf.NoFlux(), tf.Open(2.0)))},
+        {"boundary": tf.BoundaryConditions(y=(tf.NoFlux(), tf.Open(2.0))), "flow": (0.0, -1.0)},
     ],
     ids=lambda how: next(iter(how)),
 )
 def test_a_signal_that_something_supplies_is_not(how):
     quiet(lambda: with_medium(senses, **how).bind())
+
+
+def test_a_nutrient_that_nothing_supplies_is_warned_of():
+    """Monod changes it, but only takes."""
+    food = tf.Medium(food=tf.Signal(10.0), box=((-20, -20), (20, 20)), spacing=4.0)
+    with pytest.warns(UserWarning, match="'food' of the Medium is 0 and stays 0"):
+        tf.Scene(tf.Growth(), tf.Monod("food"), food, dim=2).bind()
 
 
 def test_a_signal_that_cells_or_rules_may_give_is_not():

@@ -149,7 +149,10 @@ def _sets(effects: Sequence[BoundEffect], name: str, effect: BoundEffect) -> boo
     add cells in its own way."""
     others = [e for e in effects if e.effect is not effect.effect]
     return is_own(effect.effect) or any(
-        e.effect.writes_anything or name in e.writes() or is_own(e.effect) for e in others
+        e.effect.writes_anything
+        or (name in e.writes() and name not in e.effect.only_takes())
+        or is_own(e.effect)
+        for e in others
     )
 
 

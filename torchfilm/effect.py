@@ -71,6 +71,7 @@ class Effect(metaclass=checks.KnownKeywords):
     title: ClassVar[str]
     # May a scene list it more than once?
     may_repeat: ClassVar[bool] = True
+    instead_of_two: ClassVar[str] = "Put all of it into one."
     # What it reads and writes is known only after it has been tried.
     writes_anything: ClassVar[bool] = False
     # Kernels compute its steps on the CPU, with few operations of torch between them.
@@ -176,6 +177,10 @@ class Effect(metaclass=checks.KnownKeywords):
         to give this effect then."""
         return {}
 
+    def only_takes(self) -> tuple[str, ...]:
+        """Of the fields that it writes, those that it can only make less."""
+        return ()
+
     def idle_without(self, state: State) -> Mapping[str, str]:
         """Fields without whose change by another effect this one, or a part of it, does nothing
         from this first state on; with a warning of it."""
@@ -261,6 +266,7 @@ class BoundEffect:
         self.title, self.stage = effect.title, effect.stage
         self.place = 0  # of the effect in its scene
         self.turns = 1  # of exchange with the medium in a step
+        self.eaten_too: frozenset[str] = frozenset()  # signals that nutrition exchanges, too
         self.values = Values(self._resolve(effect, binding.batch))
 
     @staticmethod

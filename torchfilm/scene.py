@@ -248,7 +248,7 @@ def _check_effects(effects: Sequence[Any]) -> None:
         count = titles.count(effect.title)
         if count > 1 and not effect.may_repeat:
             raise checks.InputError(
-                f"Scene lists {effect.title} {count} times: one is allowed. Put all of it into one."
+                f"Scene lists {effect.title} {count} times: one is allowed. {effect.instead_of_two}"
             )
 
 

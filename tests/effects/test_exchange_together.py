@@ -376,3 +376,14 @@ def test_an_equation_that_is_not_solved_is_warned_of(monkeypatch):
     with pytest.warns(RuntimeWarning, match=words):
         *_, state = tf.simulate(scene, until=0.05, dt=0.025)
     assert state.reports["circuit"].unsolved.tolist() == [2]
+
+
+def test_a_circuit_that_is_starved_by_monod_is_warned_of():
+    """Nutrition comes first in a step, so that little is left where food arrives fast."""
+    q, K = 2e4, 0.1
+    monod = tf.Monod("o2", rate=1e-3, half=K, growth_yield=1e-3 / q)
+    both = monod, tf.Growth(), tf.Circuit(eating, species="dm", q=q, K=K)
+    with pytest.warns(RuntimeWarning, match="Monod takes, too.*Let one of them take it all"):
+        list(tf.simulate(breathing(both, q, K, 1e6), until=0.05, dt=0.025))
+    gentle = monod, tf.Growth(), tf.Circuit(eating, species="dm", q=2.0, K=K)
+    list(tf.simulate(breathing(gentle, q, K, 1e6), until=0.05, dt=0.025))

@@ -27,7 +27,9 @@ def test_amounts_are_conserved_through_growth_division_and_exchange(outside, dty
         tf.Mechanics(dim=2),
         exchanging(daughters="amount"),
         tf.Medium(
-            ahl=tf.Signal(diffusion=20.0, initial=0.5, reservoir=0.7),
+            ahl=tf.Signal(
+                diffusion=20.0, initial=0.5, reservoir=0.7 if outside == "reservoir" else 0.0
+            ),
             box=((-half, -half), (half, half)),
             spacing=2.0,
             outside=outside,
@@ -291,3 +293,27 @@ def test_a_cell_inside_an_obstacle_is_beyond_the_medium():
     with pytest.raises(SimulationError, match=r"colony 1.*obstacle") as failed:
         list(tf.simulate(scene, state, until=0.1, dt=0.1))
     assert failed.value.colonies == (1,)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (
+            {"ahl": tf.Signal(5.0, reservoir=1.0)},
+            "reservoir of the signal 'ahl' = 1.0",
+        ),
+        ({"ahl": tf.Signal(5.0), "grows": "x"}, r"Medium.grows = 'x'.*outside='grow'"),
+        (
+            {"ahl": tf.Signal(5.0, boundary=tf.BoundaryConditions(x=tf.Open(2.0)))},
+            r"Open.outside of the signal 'ahl' = 2.0.*without a flow.*Dirichlet",
+        ),
+    ],
+)
+def test_what_nothing_reads_is_refused(given, words):
+    with pytest.raises(tf.InputError, match=words):
+        tf.Medium(box=BOX, spacing=4.0, **given)
+
+
+def test_a_diffusion_in_other_units_is_warned_of():
+    with pytest.warns(UserWarning, match=r"'ahl' diffuses at 2e-09 µm²/h.*m²/s"):
+        tf.Medium(ahl=tf.Signal(2e-9), box=BOX, spacing=4.0)

@@ -270,7 +270,7 @@ class BoundCircuit(BoundEffect):
         noted: Mapping[str, Any] | None = None,
     ) -> State:  # fmt: skip
         """The state with the report of a turn added to those that are `done`. noted: more of it."""
-        made = dataclasses.replace(report.report(exchanged), **(noted or {}))
+        made = dataclasses.replace(report.report(exchanged), shared=self.eaten_too, **(noted or {}))
         made = made.after(state.reports[self.title]) if done else made
         return state.replace(reports={**state.reports, self.title: made})
 

@@ -175,6 +175,7 @@ class BoundMedium(_MediumPart):
         for effect in circuits:
             effect.moves_by(self.transport if joint and effect.exchanges() else None)
             effect.turns = self.effect.steps if given and not joint else 1
+            effect.eaten_too = frozenset(both)
         if joint:
             self.transport.coupled |= dict.fromkeys(given, "circuits")
         elif given:

@@ -238,6 +238,8 @@ class Circuit(Effect):
     def title(self) -> str:  # type: ignore[override]
         return f"circuit {self.name}" if self.name else "circuit"
 
+    instead_of_two = "Give all but one a name, such as Circuit(…, name='second')."
+
     @property
     def may_repeat(self) -> bool:  # type: ignore[override]
         return bool(self.name)

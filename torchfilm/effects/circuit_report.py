@@ -29,7 +29,7 @@ class CircuitReport:
     exchanged: what cells gave to the medium; None without one. Where exchange and transport are
     solved together, (B,) each: the iterations; what cells took of signals beyond what there was,
     conc·µm³, as it may be within the circuits' tolerance; and how many parts of the step were taken
-    in turns, since their equation could not be solved."""
+    in turns, since their equation could not be solved. shared: signals that Monod takes, too."""
 
     status: Tensor
     steps: Tensor
@@ -38,6 +38,7 @@ class CircuitReport:
     iterations: Tensor | int = 0
     overdrawn: Tensor | float = 0.0
     unsolved: Tensor | int = 0
+    shared: frozenset[str] = frozenset()
     hint = (
         "Look at the signs of the rates (none may be below 0 where its species is 0), at their"
         " units (per hour), and at whether they stay finite; a smaller dt may help"
@@ -91,8 +92,15 @@ class CircuitReport:
         if isinstance(self.unsolved, Tensor) and bool((self.unsolved > 0).any()):
             return [Concern("unsolved", self.unsolved > 0, 1, _of_unsolved)]
         exchanged = self.exchanged
-        if exchanged is None or exchanged.step % LOOK or exchanged.groups.owner.numel() < CROWD:
+        if exchanged is None or exchanged.step % LOOK:
             return []
+        if self.shared:
+            given = {n: x for n, x in exchanged.given.items() if n in self.shared}
+            with one_torch_thread():
+                swing = replace(exchanged, given=given).swing
+            if bool((swing > SWING).any()):
+                said = partial(_of_shared, ", ".join(given))
+                return [Concern("shared", swing > SWING, 1, said)]
         crowd = exchanged.groups.counts >= CROWD
         if not exchanged.given or not bool(crowd.any()):
             return []
@@ -108,6 +116,16 @@ def _of_unsolved(ids: Tensor, where: Tensor) -> str:
         " could not be solved together, not even in a sixteenth of a step, so that they took turns"
         " there: what cells take may be far from right. Give a smaller dt, or a rate of exchange"
         " that changes less steeply with the signal."
+    )
+
+
+def _of_shared(names: str, ids: Tensor, where: Tensor) -> str:
+    return (
+        f"colony {', '.join(map(str, ids[where].tolist()[:5]))}: a circuit exchanges {names}, which"
+        " Monod takes, too, and most of what it finds in a turn. Monod is served first, so that the"
+        " circuit gets too little, and more turns hardly help. Let one of them take it all: Monod"
+        " (a smaller growth_yield), or the circuit (with a rule that sets growth_rate by what it"
+        " has taken)."
     )
 
 

@@ -22,7 +22,7 @@ from torchfilm.effects.medium_transport import EXACT, Transport
 from torchfilm.parameters import number_range
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Open
 from torchfilm.signals.exchange import turns_error
-from torchfilm.signals.space import checked_box, checked_flow
+from torchfilm.signals.space import check_used, checked_box, checked_flow
 from torchfilm.signals.transport import COMPILED, METHODS
 from torchfilm.signals.transport_series import MOST
 from torchfilm.state import COLONY, GRID, OUTSIDE, Field, State
@@ -186,6 +186,7 @@ class Medium(Effect):
         for name, value in given.items():
             object.__setattr__(self, name, value)
         self._check_periodic()
+        check_used(self)
 
     def _check_periodic(self) -> None:
         periodic = {self.boundary_of(name).periodic for name in self.signals}

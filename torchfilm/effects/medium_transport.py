@@ -289,8 +289,14 @@ def _on_grid(signal: Signal, name: str, what: str, state: State) -> Tensor:
     layout = state.layout
     assert layout is not None
     if callable(given):
-        found = given(layout.grid.centres())
         label = f"{what}(positions) of the signal {name!r}"
+        try:
+            found = given(layout.grid.centres())
+        except TypeError as error:
+            raise checks.InputError(
+                f"{label} cannot be called: {error}. It takes positions (nodes, 3), µm, alone; for"
+                " what changes in time simulate on from a state with another scene."
+            ) from error
         if not isinstance(found, Tensor) or found.shape != (layout.grid.nodes,):
             shown = tuple(found.shape) if isinstance(found, Tensor) else found
             raise checks.input_error(

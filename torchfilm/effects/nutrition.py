@@ -76,6 +76,10 @@ class Monod(Effect):
     stage = NUTRITION
     title = "nutrition"
     may_repeat = False
+    instead_of_two = (
+        "Cells on several nutrients: let circuits take them up, and a rule set growth_rate by what"
+        " they have taken."
+    )
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return (
@@ -91,6 +95,8 @@ class Monod(Effect):
         return ("position", "length", "radius", OUTSIDE + self.signal)
 
     def __post_init__(self) -> None:
+        if not (isinstance(self.signal, str) and self.signal.isidentifier()):
+            raise checks.input_error("Monod.signal", self.signal, "the name of one signal")
         named = isinstance(self.factor, str) and self.factor.isidentifier()
         if self.factor is not None and not named:
             raise checks.input_error(
@@ -105,6 +111,9 @@ class Monod(Effect):
 
     def writes(self) -> tuple[str, ...]:
         return ("growth_rate", OUTSIDE + self.signal, f"{self.signal}_eaten")
+
+    def only_takes(self) -> tuple[str, ...]:
+        return (OUTSIDE + self.signal,)
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         return (BoundMonod(self, binding),)

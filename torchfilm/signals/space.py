@@ -7,11 +7,15 @@ from typing import Any
 
 from torch import Tensor
 
+from torchfilm.signals.boundary_conditions import Open
 from torchfilm.tools import checks
+from torchfilm.tools.warn_once import warn
 
 # The most voxels of a colony's grid, 0.27 GB per signal in float32. Where the grid grows, one cell
 # that moves far away must not take all memory.
 MOST_VOXELS = 2**26
+# µm²/h, far below any diffusion in water, gels or cells.
+SLOWEST = 1e-5
 
 
 def checked_box(
@@ -91,3 +95,38 @@ def checked_flow(name: str, given: Any) -> Any:
             "For one velocity per colony give (vx, vy), each a tensor with one number per colony.",
         )
     return tuple(checks.value(f"{name}[{k}]", v) for k, v in enumerate(given))
+
+
+def check_used(medium: Any) -> None:
+    """Raise InputError for what a medium is given and nothing reads, and warn of a diffusion that
+    looks like one in other units."""
+    if medium.grows != "xyz" and medium.outside != "grow":
+        raise checks.input_error(
+            "Medium.grows", medium.grows, "left out", "Boxes grow with outside='grow' only."
+        )
+    for name, signal in medium.signals.items():
+        if _given(signal.reservoir) and medium.outside != "reservoir":
+            raise checks.input_error(
+                f"reservoir of the signal {name!r}",
+                signal.reservoir,
+                "left out",
+                "It counts with Medium(outside='reservoir') only.",
+            )
+        faces = [face for pair in medium.boundary_of(name).pairs for face in pair]
+        carried = [face for face in faces if isinstance(face, Open) and _given(face.outside)]
+        if carried and medium.flow_of(name) is None:
+            raise checks.input_error(
+                f"Open.outside of the signal {name!r}",
+                carried[0].outside,
+                "0 without a flow, which would carry it in",
+                "Dirichlet(…) holds a concentration at a face.",
+            )
+        if isinstance(signal.diffusion, (int, float)) and 0 < signal.diffusion < SLOWEST:
+            warn(
+                f"the signal {name!r} diffuses at {signal.diffusion:g} µm²/h: hardly at all. Is it"
+                " in m²/s? 1e-10 m²/s are 360,000 µm²/h."
+            )
+
+
+def _given(value: float | Tensor) -> bool:
+    return not isinstance(value, (int, float)) or value != 0
