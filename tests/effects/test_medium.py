@@ -298,10 +298,7 @@ def test_a_cell_inside_an_obstacle_is_beyond_the_medium():
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (
-            {"ahl": tf.Signal(5.0, reservoir=1.0)},
-            "reservoir of the signal 'ahl' = 1.0",
-        ),
+        ({"ahl": tf.Signal(5.0, reservoir=1.0)}, "reservoir of the signal 'ahl' = 1.0"),
         ({"ahl": tf.Signal(5.0), "grows": "x"}, r"Medium.grows = 'x'.*outside='grow'"),
         (
             {"ahl": tf.Signal(5.0, boundary=tf.BoundaryConditions(x=tf.Open(2.0)))},

@@ -81,11 +81,17 @@ def due_rows(state: State, size: Tensor | None) -> tuple[Tensor | None, int]:
 
 
 def divided(
-    state: State, rows: Tensor, share: Tensor, noise: Tensor, fresh: Mapping[str, float | Drawn]
+    state: State,
+    rows: Tensor,
+    share: Tensor,
+    noise: Tensor,
+    fresh: Mapping[str, float | Drawn],
+    lost: float,
 ) -> tuple[State, Tensor]:
     """The state in which the cells `rows` (M,) are divided, and the rows of their daughters (2 M,),
     first daughters first. share: (M,) or (), of the length. noise: (M,) or (), of the axes. fresh:
-    with what daughters begin in some of the fields; in the others with what their parents have."""
+    with what daughters begin in some of the fields; in the others with what their parents have.
+    lost: of the parent's length, radii."""
     from torchfilm.kernels import divisions
 
     every = state.cell_columns()
@@ -113,7 +119,7 @@ def divided(
         (array(state.position, torch.float64), real(state.axis), real(state.length),
          real(state.radius)),
         tuple(array(getattr(state, n)) for n in IDS),
-        real(share.reshape(-1)), real(noise.reshape(-1)),
+        real(share.reshape(-1)), real(noise.reshape(-1)), lost,
         np.array(noise_key), np.array(places).reshape(len(new), -1),
         np.array(numbers).reshape(len(new), 2),
     )  # fmt: skip

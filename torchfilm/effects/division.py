@@ -30,6 +30,7 @@ from torchfilm.tools.vectors import nearest_root
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, physical, smallest
 
 CRITERIA = ("length", "volume", "added")
+LOST = {"length": 2.0, "volume": 4 / 3}  # radii of the parent's length that daughters do not get
 TOO_SHORT = 1
 PIXELS = 10.0  # µm; for a longer first cell, messages say that lengths may be in pixels
 THRESHOLD = "a threshold (such as length=tf.Uniform(3.5, 4.5))"  # what it needs without rules
@@ -72,7 +73,8 @@ class Division(Effect):
 
     fraction: share of the length that the first daughter (at the −axis end) gets; a distribution is
     drawn at each division. axis_noise: standard deviation of the noise on each component of a
-    daughter's axis.
+    daughter's axis. conserves: "length", caps included, as the paper does and loses a little volume
+    by it; or "volume": then daughters' outer ends are r/3 farther out than their parent's.
     """
 
     length: Value | None = physical(None, unit="µm", above=0.0, drawn_by_effect=True)
@@ -80,6 +82,7 @@ class Division(Effect):
     added: Value | None = physical(None, unit="µm", above=0.0, drawn_by_effect=True)
     fraction: Value = physical(0.5, above=0.0, most=1.0, drawn_by_effect=True)
     axis_noise: Value = physical(0.001, least=0.0, most=0.5, drawn_by_effect=True)
+    conserves: str = "length"
 
     stage = DIVISION
     title = "division"
@@ -87,6 +90,7 @@ class Division(Effect):
     may_repeat = False
 
     def __post_init__(self) -> None:
+        checks.choice("Division.conserves", self.conserves, tuple(LOST))
         given = [name for name in CRITERIA if getattr(self, name) is not None]
         if len(given) > 1:
             raise checks.InputError(
@@ -234,7 +238,7 @@ class Division(Effect):
         return flag if size is None else flag | (size >= state.fields["division_threshold"])
 
     def step(self, state: State, dt: float, values: Values) -> State:
-        return _divided_where_due(state, *_due_by_torch(self, state), values, None)
+        return _divided_where_due(state, *_due_by_torch(self, state), values, None, self.conserves)
 
 
 class _BoundDivision(BoundEffect):
@@ -249,13 +253,12 @@ class _BoundDivision(BoundEffect):
 
     def step(self, state: State, dt: float) -> State:
         size = self.effect.size(state)
-        if knows_due(state, size):
-            rows, some_short = due_rows(state, size)
-        else:
-            rows, some_short = _due_by_torch(self.effect, state)
+        known = knows_due(state, size)
+        rows, some_short = due_rows(state, size) if known else _due_by_torch(self.effect, state)
         if rows is None:
             return state
-        return _divided_where_due(state, rows, some_short, self.values, self._fresh(state))
+        more = self._fresh(state), self.effect.conserves
+        return _divided_where_due(state, rows, some_short, self.values, *more)
 
     def _fresh(self, state: State) -> dict[str, float | Drawn] | None:
         """With what daughters begin in the fields that a division resets, if all do so by numbers
@@ -291,15 +294,16 @@ def _divided_where_due(
     some_short: int,
     values: Values,
     fresh: Mapping[str, float | Drawn] | None,
+    conserves: str,
 ) -> State:
     """The state in which the cells `rows` are divided, but those of colonies in which one is too
-    short. fresh: as `divide` has it."""
+    short. fresh: as `divide` has it. conserves: as `Division` has it."""
     if rows is not None and some_short:
         with torch.no_grad():
             state, rows = _without_short(state, rows)
     if rows is None or not rows.numel():
         return state
-    return divide(state, rows, values.fraction, values.axis_noise, fresh)
+    return divide(state, rows, values.fraction, values.axis_noise, fresh, LOST[conserves])
 
 
 def _pixels_hint(length: float, radius: float) -> str:
@@ -333,21 +337,22 @@ def divide(
     fraction: Resolved,
     axis_noise: Resolved,
     fresh: Mapping[str, float | Drawn] | None,
+    lost: float = 2.0,
 ) -> State:
     """Divides the cells `rows` (M,), ascending. The daughters are neighbours in the batch; the
     first lies at the parent's −axis end. fresh: with what daughters begin in all fields that a
     division resets, if that is known; kernels then see to it.
 
-    Their lengths are (l − 2r)f and (l − 2r)(1 − f). Their outer ends are those of the parent.
-    Gradients pass through.
+    Their lengths are (l − lost·r)f and (l − lost·r)(1 − f). They touch, with their middle in that
+    of the parent. Gradients pass through.
     """
     share = _of_rows(fraction, state, rows, "Division.fraction")
     by_kernels = can_divide(state, share, axis_noise)
     if by_kernels:
         noise = _of_rows(axis_noise, state, rows)
-        new, daughters = divided(state, rows, share, noise, fresh or {})
+        new, daughters = divided(state, rows, share, noise, fresh or {}, lost)
     else:
-        new, daughters = _divided(state, rows, share, axis_noise)
+        new, daughters = _divided(state, rows, share, axis_noise, lost)
     first, second = daughters.chunk(2)
     births = Births(first, second, new.uid.index_select(0, daughters), state, rows)
     colony_id = state.colony_id.index_select(0, state.colony.index_select(0, rows))
@@ -365,7 +370,7 @@ def _of_rows(value: Resolved, state: State, rows: Tensor, purpose: str | None = 
 
 
 def _divided(
-    state: State, rows: Tensor, share: Tensor, axis_noise: Resolved
+    state: State, rows: Tensor, share: Tensor, axis_noise: Resolved, lost: float
 ) -> tuple[State, Tensor]:
     """As `compiled_division.divided`, by torch, with daughters whose fields are their parents'."""
     due = torch.zeros_like(state.colony).index_fill(0, rows, 1)
@@ -379,9 +384,10 @@ def _divided(
     length, radius, axis = (
         x.index_select(0, rows) for x in (state.length, state.radius, state.axis)
     )
-    rest = length - 2 * radius
+    rest = length - lost * radius
     lengths = torch.cat([rest * share, rest * (1 - share)])
     shift = 0.5 * (lengths - torch.cat([length, length]))
+    shift = shift - (1 - 0.5 * lost) * torch.cat([radius, radius])
     shift = torch.cat([shift[: rows.numel()], -shift[rows.numel() :]]).unsqueeze(1)
     axis = torch.cat([axis, axis])
     moved = (shift * axis).to(new.position.dtype)

@@ -34,18 +34,19 @@ def due_rows(flag, size, threshold, length, radius):
 
 
 @kernel(entry=True)
-def divide(rows, cells, ids, share, sd, key, columns, numbers):
+def divide(rows, cells, ids, share, sd, lost, key, columns, numbers):
     """Makes two cells, side by side, of each of the M cells `rows` of N.
 
     cells: position (N, d) float64, axis (N, d), length and radius (N,) of one type. ids: colony,
     uid and parent (N,), next uid and stream of each colony. share of the length that first
-    daughters get, and sd of the noise of axes: (M,), or (1,) for all. key (3,): the words of the
+    daughters get, and sd of the noise of axes: (M,), or (1,) for all. lost: radii of a parent's
+    length that daughters do not get. key (3,): the words of the
     noise. columns (K, 8): places of all others, with `numbers` (K, 2) from which daughters begin.
     Returns the rows of the daughters (2 M,), first daughters first; uid, parent and the next uid of
     each colony, numbered on; and position, axis and length of N + M cells.
     """
     daughters, source, of_ids = _split(rows, ids)
-    made = _placed(rows, daughters, source, cells, share)
+    made = _placed(rows, daughters, source, cells, share, lost)
     colony, stream, uid = ids[0], ids[4], of_ids[0]
     own = np.empty((daughters.shape[0], 2), np.int64)
     for k in range(daughters.shape[0]):
@@ -77,12 +78,13 @@ def _split(rows, ids):
 
 
 @kernel
-def _placed(rows, daughters, source, cells, share):
+def _placed(rows, daughters, source, cells, share, lost):
     """Position, axis and length of the new cells; daughters have their parents' axes. All but the
     position is of one type, as torch would compute."""
     position, axis, length, radius = cells
     m, d = rows.shape[0], axis.shape[1]
     half, one = length.dtype.type(0.5), length.dtype.type(1)
+    less, apart = length.dtype.type(lost), length.dtype.type(1 - 0.5 * lost)
     new_position, new_axis = np.empty((source.size, d)), np.empty((source.size, d), axis.dtype)
     new_length = np.empty(source.size, length.dtype)
     for r in range(source.size):
@@ -93,9 +95,9 @@ def _placed(rows, daughters, source, cells, share):
     for k in range(2 * m):
         parent, cell = rows[k % m], daughters[k]
         part = share[k % m] if share.shape[0] > 1 else share[0]
-        rest = length[parent] - (radius[parent] + radius[parent])
+        rest = length[parent] - less * radius[parent]
         new_length[cell] = rest * (part if k < m else one - part)
-        shift = half * (new_length[cell] - length[parent])
+        shift = half * (new_length[cell] - length[parent]) - apart * radius[parent]
         for c in range(d):
             moved = shift * axis[parent, c]
             new_position[cell, c] += moved if k < m else -moved
