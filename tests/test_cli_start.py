@@ -40,3 +40,8 @@ def test_start_from_a_label_image(command):
         first = results.frame(0)
     assert first["position"][:, 0].tolist() == pytest.approx([1.95, 3.45])
     assert (first["length"] + 2 * first["radius"]).tolist() == pytest.approx([3.0, 3.0], rel=0.15)
+
+
+def test_the_version(command, capsys):
+    command("--version")
+    assert capsys.readouterr().out == f"torchfilm {tf.__version__}\n"

@@ -72,7 +72,7 @@ class States(Generator[State, State | None, None]):
         return f"<states of a run that has {begun}>"
 
     def __del__(self) -> None:
-        if not self._begun:
+        if not getattr(self, "_begun", True):  # a copy that failed has nothing
             warn(
                 "simulate(…) has simulated nothing, since none of its states was taken. Write"
                 " `for state in tf.simulate(…): …`, with `pass` where only the last state, or the"

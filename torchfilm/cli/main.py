@@ -14,6 +14,7 @@ from typing import Any
 from torchfilm.tools.checks import InputError, SimulationError, install, unknown_keyword
 from torchfilm.tools.memory import keep_memory
 from torchfilm.tools.warn_once import once
+from torchfilm.version import __version__
 
 try:
     import tyro
@@ -55,6 +56,9 @@ def main() -> None:
 
 
 def _command() -> None:
+    if sys.argv[1:] == ["--version"]:
+        print(f"torchfilm {__version__}")
+        return
     try:
         check_options(sys.argv[1:])
     except InputError as error:
@@ -62,7 +66,7 @@ def _command() -> None:
     command = tyro.extras.subcommand_cli_from_dict(
         {**COMMANDS},
         prog="torchfilm",
-        description="Synthetic microbial biofilms, many colonies at once.",
+        description="Synthetic microbial biofilms, many colonies at once. --version: this one's.",
         args=gather_repeated(sys.argv[1:]),
     )
     keep_memory()

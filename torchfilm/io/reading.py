@@ -125,7 +125,8 @@ def is_results(path: Path) -> bool:
 def _open_hdf5(path: Path) -> h5py.File:
     """Open an HDF5 file to read: complete, growing, or left by a killed run."""
     if not path.is_file():
-        raise checks.input_error("results", str(path), "a results file", "No such file.")
+        why = "This is a folder." if path.is_dir() else "No such file."
+        raise checks.input_error("results", str(path), "a results file", why)
     error: Exception | None = None
     with open(path, "rb") as raw:
         head = raw.read(48)

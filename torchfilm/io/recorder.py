@@ -182,7 +182,8 @@ class Recorder(metaclass=checks.KnownKeywords):
                 "record",
                 str(self.path),
                 "a path where there is no file yet",
-                "A Recorder writes one run; make another for the next.",
+                "A file has come there since this Recorder was made: of an earlier run of it, or of"
+                " another process. Choose another path.",
             )
         replacing.check_replaceable(self.path)
 
