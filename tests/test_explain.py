@@ -379,3 +379,9 @@ def test_what_taking_turns_costs_a_signal_is_said_where_it_is_much():
 def test_a_depth_that_goes_by_the_spacing_is_said():
     assert "as deep as a voxel is wide" in tf.explain(tf.Scene(*BODY, medium()), seconds=0)
     assert "as deep as" not in tf.explain(tf.Scene(*BODY, medium(depth=8.0)), seconds=0)
+
+
+def test_a_prompt_and_a_notebook_show_its_lines():
+    told = tf.explain(tf.Scene(tf.Growth(rate=1.0), dim=2), seconds=0)
+    assert repr(told) == str(told) and "\n" in repr(told)
+    assert told._repr_html_().startswith("<pre") and told.splitlines()[0] in told._repr_html_()

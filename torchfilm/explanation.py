@@ -9,7 +9,7 @@ from torchfilm.cost_estimate import PROBE_COLONIES, cost_lines
 from torchfilm.effects import KNOWN
 from torchfilm.model import Model
 from torchfilm.scene import Scene
-from torchfilm.tools import checks
+from torchfilm.tools import checks, displays
 from torchfilm.tools.warn_once import once
 
 
@@ -67,7 +67,7 @@ def explain(
                 scene, state.colonies, cells, max(fixed, colonies or 1), device, seconds
             )
         ]
-    return "\n".join(lines)
+    return displays.Text("\n".join(lines))
 
 
 def left_out(scene: Scene) -> list[str]:

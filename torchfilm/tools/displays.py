@@ -66,6 +66,16 @@ def lines(words: str) -> str:
     return f'<div style="margin:.3em 0;white-space:pre-line">{escape(words)}</div>' if words else ""
 
 
+class Text(str):
+    """A text of several lines, which a notebook and a Python prompt show as such."""
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        return text(self)
+
+
 def text(words: str) -> str:
     """A text with its line breaks, in letters of one width."""
     style = "margin:.3em 0;background:transparent;color:inherit;line-height:1.35"
