@@ -68,7 +68,7 @@ class Recorder(metaclass=checks.KnownKeywords):
         append: bool = False,
         changed: bool = False,
     ):
-        self.path, self.scene = Path(path), scene
+        self.path, self.scene = checks.file_path("record", path), scene
         self.every = checks.integer("every", every, least=1)
         self.overwrite, self.append, self.changed = overwrite, append, changed
         self._check_path()

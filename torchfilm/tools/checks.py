@@ -340,11 +340,18 @@ def vector(name: str, given: object, size: int | None = None) -> tuple[float, ..
     return out
 
 
+LONGEST_NAME = 240  # bytes; file systems take 255, and what is written may first end in ".new"
+
+
 def file_path(name: str, given: object, suffix: str = "") -> Path:
     """The path of a file, or InputError for what is no path, or has another suffix than this."""
     if not isinstance(given, (str, os.PathLike)):
         raise input_error(name, given, "the path of a file")
     path = Path(given)
+    if "\0" in str(path) or any(len(os.fsencode(part)) > LONGEST_NAME for part in path.parts):
+        shown = f"{str(path)[:40]!r}…"
+        raise InputError(f"{name} = {shown} is no path that a file can have: it is too long, or has"
+                         " a NUL in it. Choose another.")  # fmt: skip
     if suffix and path.suffix.lower() != suffix:
         hint = f"Such as {str(path.with_suffix(suffix))!r}." if path.name else ""
         raise input_error(name, given, f"the path of a file that ends in {suffix!r}", hint)
