@@ -1,0 +1,44 @@
+"""Hard case 48: cells that live on what diffusion brings, while their demand is far higher."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import torchfilm as tf
+
+SIDES = tf.BoundaryConditions(x=tf.Dirichlet(1.0), y=tf.Dirichlet(1.0))
+DEMAND, DIFFUSION = 2e5, 1e6  # conc/h in a cell, and µm²/h, as of oxygen
+
+
+def eating(u, s, p, cell):
+    return {"dm": 0.0 * u.dm}, {"o2": -p.q * cell.volume * s.o2 / (p.K + s.o2)}
+
+
+def brought(eaters: tuple, dtype: torch.dtype) -> tuple[float, torch.Tensor]:
+    """What comes through the sides per hour after two steps, and the signal."""
+    medium = tf.Medium(
+        o2=tf.Signal(DIFFUSION, initial=1.0, boundary=SIDES), box=((-60, -60), (60, 60)),
+        spacing=4.0, depth=1.0,
+    )  # fmt: skip
+    scene = tf.Scene(*eaters, medium, founders=tf.inoculum(60, radius=20.0), dim=2)
+    *_, state = tf.simulate(scene, until=0.05, dt=0.025, dtype=dtype)
+    u = state.signals["o2"].double().reshape(30, 30)
+    missing = sum(float((1 - side).sum()) for side in (u[0], u[-1], u[:, 0], u[:, -1]))
+    return 2 * DIFFUSION * missing, u
+
+
+@pytest.mark.parametrize("K", [1e-2, 1e-3, 1e-6])
+def test_case_48_living_on_what_arrives(dtype, measured, K):
+    """Sixty cells that would eat ten thousand times what is about them in a step, half-saturated at
+    1e-2, 1e-3 and 1e-6 of what the sides hold, by a circuit and by Monod: u ≥ 0, both eat alike."""
+    circuit = tf.Growth(rate=1e-3), tf.Circuit(eating, species="dm", q=DEMAND, K=K)
+    monod = tf.Growth(), tf.Monod("o2", rate=1e-3, half=K, growth_yield=1e-3 / DEMAND)
+    (one, u), (other, v) = brought(circuit, dtype), brought(monod, dtype)
+    lowest = min(float(u.min()), float(v.min()))
+    assert measured("lowest concentration", lowest, "≥ 0") >= 0.0
+    assert other > 1e6  # diffusion limits what they get: they ask for six times as much
+    difference = abs(one / other - 1)
+    assert measured("eaten by the circuit over Monod's, off 1", difference, "≤ 0.02") <= 0.02
+    assert np.isfinite(u.numpy()).all()
