@@ -95,7 +95,7 @@ def test_a_cell_that_is_its_own_ancestor_is_reported(copy):
 @pytest.mark.parametrize("name", ["x" * 300 + ".h5", "a\0b.h5"])
 def test_a_name_that_no_file_can_have_is_refused(name):
     scene = tf.Scene(tf.Growth(rate=1.0), dim=2)
-    with pytest.raises(tf.InputError, match="record = .* is no path that a file can have"):
+    with pytest.raises(tf.InputError, match=r"record = .* is no path that a file can have"):
         tf.simulate(scene, until=0.1, record=name)
     with pytest.raises(tf.InputError, match="is no path that a file can have"):
         tf.Results(name)
