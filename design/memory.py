@@ -78,7 +78,7 @@ def bytes_of_group(
     least = 2**63
     # a container sees its own group at the root, whatever is listed
     for line in ["0::/", "0:memory:/", *_text(listed).splitlines()]:
-        _, kind, path = line.split(":", 2)
+        _, kind, path = [*line.split(":", 2), "none", ""][:3]
         if kind in ("", "memory"):
             top, names = (root / "memory", OLD_GROUP_FILES) if kind else (root, GROUP_FILES)
             folder = top / path.lstrip("/")
@@ -94,8 +94,9 @@ def _left_by(group: Path, most: str, used: str, kept: str) -> int:
     limit, taken = (_text(group / name).strip() for name in (most, used))
     if not (limit.isdigit() and taken.isdigit()):
         return 2**63
-    stat = dict(line.split(" ", 1) for line in _text(group / "memory.stat").splitlines())
-    return max(0, int(limit) - int(taken) + int(stat.get(kept, 0)))
+    lines = [line.split() for line in _text(group / "memory.stat").splitlines()]
+    gives_way = [int(words[1]) for words in lines if len(words) == 2 and words[0] == kept]
+    return max(0, int(limit) - int(taken) + sum(gives_way))
 
 
 def _text(path: Path) -> str:

@@ -65,12 +65,21 @@ class Prior:
         known = self.given[name]
         if isinstance(known, Mapping):
             return ", ".join(f"{share:g} {option!r}" for option, share in known.items())
-        settings = [f"{x!r}" for x in known.args] + [f"{k}={v!r}" for k, v in known.kwds.items()]
-        return f"{known.dist.name}({', '.join(settings)})"
+        settings = [f"{_shown(x)}" for x in known.args]
+        settings += [f"{k}={_shown(v)}" for k, v in known.kwds.items()]
+        return f"{known.dist.name or 'distribution'}({', '.join(settings)})"
 
     def describe(self) -> dict[str, str]:
-        """As plain data."""
-        return {name: self.words(name) for name in self.given}
+        """As plain data: of a distribution some quantiles, whatever it is called."""
+        return {
+            name: self.words(name) if isinstance(known, Mapping)
+            else " ".join(f"{x:.10g}" for x in known.ppf(np.linspace(0.025, 0.975, 20)))
+            for name, known in self.given.items()
+        }  # fmt: skip
+
+
+def _shown(value: Any) -> str:
+    return f"{value:g}" if np.ndim(value) == 0 else "…"
 
 
 def _coordinates(ends: np.ndarray, units: np.ndarray) -> np.ndarray:
@@ -102,6 +111,8 @@ def _within(parameter: Parameter, given: Any) -> tuple[float, float]:
         kind = "a discrete distribution, since it is a whole number" if parameter.whole else NUMBERS
         raise checks.input_error(name, given.dist.name, kind)
     below = parameter.low - 1 if discrete else parameter.low
+    if np.ndim(given.cdf(below)):
+        raise checks.input_error(name, given.dist.name, "one distribution, not several")
     low, high = float(given.cdf(below)), float(given.cdf(parameter.high))
     if not high - low >= LEAST:
         raise checks.input_error(

@@ -56,6 +56,16 @@ def test_data_in_other_places_are_not_read(copy, tmp_path, kind):
         pass
 
 
+def test_what_others_have_added_does_no_harm(copy):
+    with h5py.File(copy, "a") as file:
+        file["mine"] = np.dtype("f8")  # a named type
+        for k in range(1200):
+            file.create_group(f"notes/{k}")
+        file["notes/again"] = file["notes"]  # a circle
+    with tf.Results(copy) as results:
+        assert len(results.frame(-1)["uid"]) > 1
+
+
 @pytest.mark.parametrize("name", ["recipe", "settings", "walls", "accuracy", "internal"])
 @pytest.mark.parametrize("value", ["{", 3.5, [1, 2]])
 def test_attributes_that_make_no_sense_are_reported(copy, name, value):

@@ -22,7 +22,15 @@ torch.ones(2_000_000).exp().sum()                       # torch starts its threa
 scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2))
 run = lambda: list(tf.simulate(scene, cells=40, colonies=30))[-1]
 wanted = run()
+model = scene.bind(colonies=30)
+first = model.start()
 child = os.fork()
+if child == 0 and sys.argv[1] == "step":
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model.step(first)
+    torch.ones(2_000_000).exp().sum()
+    os._exit(0)
 if child == 0:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -36,8 +44,9 @@ sys.exit(os.waitstatus_to_exitcode(status))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks")
-def test_a_fork_computes_in_one_thread_and_says_so():
-    done = subprocess.run([sys.executable, "-c", FORKED], capture_output=True, timeout=120)
+@pytest.mark.parametrize("how", ["run", "step"])
+def test_a_fork_computes_in_one_thread_and_says_so(how):
+    done = subprocess.run([sys.executable, "-c", FORKED, how], capture_output=True, timeout=120)
     assert done.returncode == 0, done.stderr.decode()
 
 

@@ -340,6 +340,9 @@ class BoundEffect:
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         """Raise InputError if this effect cannot act together with the others (all traced)."""
 
+    def check_given(self, state: State) -> None:
+        """Raise InputError if this effect cannot go on with a state that was given."""
+
     def warn_of_others(self) -> None:
         """Warn where this effect and the others, checked before, are probably not meant so."""
 

@@ -93,6 +93,7 @@ class Model:
 
     def step(self, state: State, dt: float | None = None, timings: Timings | None = None) -> State:
         """The state dt hours later (by default the scene's step): each effect in turn."""
+        after_fork()
         dt, state = self.dt if dt is None else dt, self.opened(state)
         # torch's threads are set once a step, not once an effect
         alone = one_torch_thread() if self._by_kernels else nullcontext()
@@ -193,6 +194,7 @@ class Model:
                 " the state is not of this scene."
             )
         for effect in self.effects:
+            effect.check_given(state)
             for name in (*effect.effect.needs(), *(f.name for f in effect.declares())):
                 if name not in state.fields and name not in BUILT_IN:
                     raise checks.InputError(

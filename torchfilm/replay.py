@@ -28,7 +28,7 @@ from torchfilm.together import Together
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import unchanged
 from torchfilm.tools.ragged import expand_ranges, offsets
-from torchfilm.tools.threads import one_torch_thread
+from torchfilm.tools.threads import after_fork, one_torch_thread
 from torchfilm.tools.warn_once import once
 from torchfilm.turns import Turns
 
@@ -277,6 +277,7 @@ class Replay(metaclass=checks.KnownKeywords):
     @one_torch_thread()
     def step(self, state: State) -> State:
         """The state one step later."""
+        after_fork()
         number = state.step
         if number == 0:
             self._check_streams(state)

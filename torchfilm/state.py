@@ -274,10 +274,9 @@ class State:
         return (self._rows[self.declared[name].scope], *self.declared[name].shape)
 
     def check_fields(self) -> None:
-        """Raise InputError for a field of another number of rows, and for a signal below 0."""
+        """Raise InputError for a field of another number of rows."""
         scopes = {n: self.declared[n].scope for n in self.fields}
-        signals = [n for n in self.fields if n.startswith(OUTSIDE)]
-        row_checks.check_fields(self.fields, scopes, self._rows, signals)
+        row_checks.check_fields(self.fields, scopes, self._rows)
 
     def declare(self, field: Field) -> State:
         """A state that has one more field, at its initial value."""

@@ -72,13 +72,22 @@ def test_a_law_that_is_a_difference_goes_both_ways():
     [
         ("turn: -> a; kin - kout*a; kin = 1; kout = 1;", 2),
         ("turn: a -> ; kout*a - kin; kin = 1; kout = 1;", 2),
-        # these are no two reactions: what is made falls with what is there
+        ("turn: -> a; D*(out - a); D = 3; out = 2;", 2),
+        ("turn: a -> ; -(kin - kout*a); kin = 1; kout = 1;", 2),
+        ("turn: -> a; kin + (-kout*a) + more; kin = 1; kout = 1; more = 2;", 2),
+        ("turn: -> a; k*a*(1 - a/K); k = 1; K = 5;", 2),
+        # never below 0: what is made falls with what is there
         ("turn: -> a; k*(1 - b/(1 + b)); k = 1; species b; b = 0.3;", 1),
         ("turn: -> a; k*(1 - a/(1 + a)); k = 1;", 1),
+        ("turn: a -> b; k*a*(1 - b/(K + b)); k = 1; K = 2; species b; b = 0;", 1),
         ("turn: a -> b; v*(a - b/q)/(1 + a + b); v = 1; q = 2; species b; b = 0;", 2),
         ("turn: a -> b; -(r*b - f*a)*v; v = 1; f = 2; r = 1; species b; b = 0;", 2),
         ("turn: a -> b; f*a; f = 1; species b; b = 0;", 1),
         ("turn: a -> b; (f - r*b)*a; f = 5; r = 1; species b; b = 0;", 2),
+        (
+            "compartment c = 2; species d in c; turn: -> d; c*kin - c*kout*d; kin = 1; kout = 1; d = 0;",
+            2,
+        ),
     ],
 )
 def test_only_what_goes_back_is_a_reaction_back(text, ways):
@@ -87,7 +96,7 @@ def test_only_what_goes_back_is_a_reaction_back(text, ways):
     assert [x.name for x in found] == ["turn", "turn backwards"][:ways]
     # together they are the law
     one, other = read(text), read(text, method="direct")
-    values = {"a": 0.7, "b": 0.4, **one.parameters}
+    values = {"a": 0.7, "b": 0.4, "d": 0.3, **one.parameters}
     wanted, made = (
         c.graph.evaluate({n: x for n, x in values.items() if n in (*c.species, *c.parameters)})
         for c in (one, other)
@@ -157,8 +166,22 @@ def test_what_has_no_whole_molecules_is_refused(text, words):
         read(text, method="tau_leap")
 
 
-def test_a_law_below_zero_fails_by_name():
-    text = "species a; make: -> a; k*(1 - 2*b/(1 + b)); k = 50; species b; b = 4; a = 0;"
-    circuit = read(text, method="direct", molecules_per_unit=1.0)
-    with pytest.raises(tf.SimulationError, match="make"):
-        list(tf.simulate(tf.Scene(circuit, founders=CELL, dim=2, dt=0.1), until=0.5))
+def test_an_inhibited_law_stays_one_way_beside_one_that_goes_back():
+    law = "k*a/(1 + b)*(1 - b/(2 + b)) - r*b"
+    first, back = reactions_of(f"species a, b; turn: a -> b; {law}; k = 1; r = 2; a = 1; b = 0;")
+    assert (first.rate.reads, back.rate.reads) == (("a", "b"), ("b",))
+
+
+@pytest.mark.parametrize(
+    ("text", "sides_wanted"),
+    [
+        ("species a, A; J: -> A; k*a; k = 2; a = 1; A = 0;", ({}, {"out.A": 1})),
+        ("species a, A; J: A -> ; k*a*A; k = 2; a = 1; A = 0;", ({"out.A": 1}, {})),
+    ],
+)
+def test_a_species_that_makes_or_takes_a_signal(text, sides_wanted):
+    text += "keep: -> a; l; l = 1;"
+    assert sides(text, signals={"A": "A"})["J"] == sides_wanted
+    with pytest.raises(tf.InputError, match="'J' happens outside of cells"):
+        read("species a, A; J: -> A; k; keep: -> a; l; k = 2; l = 1; a = 1; A = 0;",
+             signals={"A": "A"}, method="direct")  # fmt: skip

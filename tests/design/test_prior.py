@@ -64,6 +64,7 @@ def test_nothing_given_changes_nothing():
         ({"rate": stats.norm}, "frozen distribution"),
         ({"rate": stats.poisson(1.0)}, "frozen distribution"),
         ({"genes": stats.norm(2, 1)}, "discrete distribution"),
+        ({"rate": stats.norm([1, 2], 1)}, "one distribution, not several"),
         ({"rate": stats.norm(20.0, 1.0)}, "at least 0.001 lies within the bounds"),
         ({"promoter": {"weak": 1.0}}, "share of each option"),
         ({"promoter": {"weak": 0.5, "strong": 0.6, "off": 0.0}}, "add up to 1"),
@@ -85,15 +86,22 @@ def test_a_file_keeps_to_its_prior(data, tmp_path):  # noqa: F811
             simulate_designs(task, 4, prior=other, path=path)
 
 
+def test_distributions_are_told_apart_by_their_numbers():
+    made = lambda edges: stats.rv_histogram((np.array([1.0, 2.0]), np.array(edges)), density=True)()
+    of = lambda known: Prior(SPACE, {"rate": known}).describe()
+    assert of(made([0.6, 1.0, 1.5])) != of(made([0.6, 1.2, 1.5]))
+    assert of(stats.norm(np.float64(1), 0.5)) == of(stats.norm(loc=1, scale=0.5))
+
+
 @needs_sbi
 def test_where_the_data_say_nothing_the_posterior_is_the_prior(data, tmp_path):  # noqa: F811
     parameters = [Parameter("rate", 0.8, 2.0, log=True), Parameter("make", 0.2, 3.0)]
     found = infer(
         colony, parameters, data, until=2.0, dt=0.1, simulations=300, seed=2, progress=False,
-        prior={"make": stats.norm(1.0, 0.15)},
+        prior={"make": stats.norm(1, 0.15)},
     )  # fmt: skip
     make = found.samples["make"]
     assert make.mean() == pytest.approx(1.0, abs=0.08) and 0.09 < make.std() < 0.24
-    assert "of 0.2 to 3, norm(1.0, 0.15)" in found.table()
+    assert "of 0.2 to 3, norm(1, 0.15)" in found.table()
     picture = found.plot(tmp_path / "posterior.png")
     assert "line: before the data" in picture.figure.get_suptitle().replace("\n", " ")

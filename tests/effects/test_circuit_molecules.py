@@ -239,9 +239,10 @@ def test_molecules_through_the_membrane_are_conserved(method, outside, dtype):
         molecules_per_unit=2.0,
         D1=1.0,
     )
+    around = {"reservoir": 1.0} if outside == "reservoir" else {}
     scene = tf.Scene(
         circuit,
-        tf.Medium(a=tf.Signal(diffusion=5.0, initial=0.5, reservoir=1.0), outside=outside, **BOX),
+        tf.Medium(a=tf.Signal(diffusion=5.0, initial=0.5, **around), outside=outside, **BOX),
         founders=side_by_side(3),
     )
     state = scene.bind(2, dtype=dtype).start()

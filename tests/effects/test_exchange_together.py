@@ -385,5 +385,8 @@ def test_a_circuit_that_is_starved_by_monod_is_warned_of():
     both = monod, tf.Growth(), tf.Circuit(eating, species="dm", q=q, K=K)
     with pytest.warns(RuntimeWarning, match="Monod takes, too.*Let one of them take it all"):
         list(tf.simulate(breathing(both, q, K, 1e6), until=0.05, dt=0.025))
+    giving = lambda u, s, p, cell: ({"dm": 0.0 * u.dm}, {"o2": 500.0})
+    gives = monod, tf.Growth(), tf.Circuit(giving, species="dm")
+    list(tf.simulate(breathing(gives, q, K, 100.0), until=0.05, dt=0.025))
     gentle = monod, tf.Growth(), tf.Circuit(eating, species="dm", q=2.0, K=K)
     list(tf.simulate(breathing(gentle, q, K, 1e6), until=0.05, dt=0.025))

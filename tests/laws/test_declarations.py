@@ -142,7 +142,8 @@ def body(rate=1.0, dim=2) -> list[tf.Effect]:
 
 
 def medium(**options) -> tf.Medium:
-    food = tf.Signal(diffusion=5.0, initial=9.0, reservoir=3.0)
+    around = {"reservoir": 3.0} if options.get("outside") == "reservoir" else {}
+    food = tf.Signal(diffusion=5.0, initial=9.0, **around)
     return tf.Medium(food=food, box=((-6, -6), (6, 6)), spacing=2.0, **options)
 
 

@@ -168,3 +168,16 @@ def test_a_signal_that_cannot_be_is_refused(values, words):
     state = scene.bind().start()
     with pytest.raises(tf.InputError, match=words):
         list(tf.simulate(scene, state.with_fields(**{"out.food": values}), until=0.1))
+
+
+def test_a_method_that_goes_below_0_may():
+    """Crank–Nicolson, as documented; also where its state is gone on with."""
+    disc = lambda places: ((places[:, :2].norm(dim=1) < 4.0) * 1.0).float()
+    medium = tf.Medium(
+        a=tf.Signal(5e4, initial=disc), box=((-16, -16), (16, 16)), spacing=1.0,
+        method="crank_nicolson",
+    )  # fmt: skip
+    scene = tf.Scene(medium, dim=2)
+    *_, state = tf.simulate(scene, until=0.02, dt=0.01)
+    assert float(state.signals["a"].min()) < 0
+    *_, state = tf.simulate(scene, state, until=0.03, dt=0.01)

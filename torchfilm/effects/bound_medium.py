@@ -26,6 +26,7 @@ from torchfilm.signals.space import MOST_VOXELS
 from torchfilm.state import GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.reads import reads_are_free
+from torchfilm.tools.row_checks import check_signals
 
 if TYPE_CHECKING:
     from torchfilm.effects.medium import Medium
@@ -154,6 +155,10 @@ class BoundMedium(_MediumPart):
             )
         for name in medium.signals:
             self.transport.check(name, state)
+
+    def check_given(self, state: State) -> None:
+        if self.effect.method not in ("crank_nicolson", "euler"):  # these may go below 0
+            check_signals(state.fields)
 
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         others = [e for e in effects if e.place != self.place and e.stage > BEFORE_CELLS]

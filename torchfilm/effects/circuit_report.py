@@ -95,7 +95,8 @@ class CircuitReport:
         if exchanged is None or exchanged.step % LOOK:
             return []
         if self.shared:
-            given = {n: x for n, x in exchanged.given.items() if n in self.shared}
+            both = {n: x for n, x in exchanged.given.items() if n in self.shared}
+            given = {n: x.clamp(max=0.0) for n, x in both.items()}  # what they take
             with one_torch_thread():
                 swing = replace(exchanged, given=given).swing
             if bool((swing > SWING).any()):

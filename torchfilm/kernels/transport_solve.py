@@ -45,7 +45,7 @@ def conjugate_gradients(x, r, pad, grid, many, inverse, target, most, spare):
     """As `transport_iterative._conjugate_gradients`: x and r in place; x, spare: with padding;
     inverse: of the diagonal."""
     size = r.size
-    p, q = spare[0], spare[1, :size]
+    p, q = spare[0], spare[1, pad : pad + size]
     for i in range(size):
         p[pad + i] = inverse[i] * r[i]
     product_of = dot(p[pad : pad + size], r)
@@ -70,8 +70,9 @@ def bicgstab(x, r, pad, grid, many, inverse, target, most, spare):
     """As `transport_iterative._bicgstab`: x and r in place; x, spare: with padding; inverse: of the
     diagonal."""
     size = r.size
-    p, s, scaled = spare[0, :size], spare[1, :size], spare[5]
-    v, t, shadow = spare[2, :size], spare[3, :size], spare[4, :size]
+    inner = slice(pad, pad + size)  # what lies beside it stays 0
+    p, s, scaled = spare[0, inner], spare[1, inner], spare[5]
+    v, t, shadow = spare[2, inner], spare[3, inner], spare[4, inner]
     for i in range(size):
         p[i] = shadow[i] = r[i]
     rho = dot(r, r)
@@ -105,7 +106,7 @@ def backward_euler(x, b, r, pad, grid, many, tolerance, rounding, symmetric, mos
     """Solve (I + many (I − P)) x = b for one grid, from x, and leave the residual in r. Whether it
     converged. tolerance: of the residual over b. rounding: times many, over x. spare: `SPARE` rows,
     0 in their padding."""
-    inverse, stay, inner = spare[6, : b.size], grid[1], x[pad : pad + b.size]
+    inverse, stay, inner = spare[6, pad : pad + b.size], grid[1], x[pad : pad + b.size]
     for i in range(b.size):
         inverse[i] = 1 / (1 + many * (1 - stay[i]))
     for trial in range(4):

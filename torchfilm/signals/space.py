@@ -98,28 +98,22 @@ def checked_flow(name: str, given: Any) -> Any:
 
 
 def check_used(medium: Any) -> None:
-    """Raise InputError for what a medium is given and nothing reads, and warn of a diffusion that
-    looks like one in other units."""
+    """Warn of what a medium is given and nothing reads, and of a diffusion that looks like one in
+    other units."""
     if medium.grows != "xyz" and medium.outside != "grow":
-        raise checks.input_error(
-            "Medium.grows", medium.grows, "left out", "Boxes grow with outside='grow' only."
-        )
+        warn(f"Medium(grows={medium.grows!r}) does nothing: boxes grow with outside='grow'.")
     for name, signal in medium.signals.items():
         if _given(signal.reservoir) and medium.outside != "reservoir":
-            raise checks.input_error(
-                f"reservoir of the signal {name!r}",
-                signal.reservoir,
-                "left out",
-                "It counts with Medium(outside='reservoir') only.",
+            warn(
+                f"the reservoir of the signal {name!r} does nothing: cells find it with"
+                " Medium(outside='reservoir')."
             )
         faces = [face for pair in medium.boundary_of(name).pairs for face in pair]
-        carried = [face for face in faces if isinstance(face, Open) and _given(face.outside)]
+        carried = any(isinstance(face, Open) and _given(face.outside) for face in faces)
         if carried and medium.flow_of(name) is None:
-            raise checks.input_error(
-                f"Open.outside of the signal {name!r}",
-                carried[0].outside,
-                "0 without a flow, which would carry it in",
-                "Dirichlet(…) holds a concentration at a face.",
+            warn(
+                f"Open(outside=…) of the signal {name!r} does nothing, since no flow carries it in."
+                " Dirichlet(…) holds a concentration at a face."
             )
         if isinstance(signal.diffusion, (int, float)) and 0 < signal.diffusion < SLOWEST:
             warn(
@@ -129,4 +123,4 @@ def check_used(medium: Any) -> None:
 
 
 def _given(value: float | Tensor) -> bool:
-    return not isinstance(value, (int, float)) or value != 0
+    return bool((value != 0).any()) if isinstance(value, Tensor) else value != 0

@@ -128,7 +128,7 @@ def only_own_data(file: Any) -> None:
     with data in other files. A file from elsewhere could show what it should not."""
     import h5py  # most scripts do without it
 
-    groups = [file]
+    groups, seen = [file], set()
     for group in groups:
         for name in group:
             part = f"{group.name.rstrip('/')}/{name}"
@@ -136,9 +136,11 @@ def only_own_data(file: Any) -> None:
             item = group[name] if own else None
             if isinstance(item, h5py.Dataset):
                 own = not (item.is_virtual or item.external)
-            elif item is not None:
-                groups.append(item)
-            if not own or len(groups) > 1000:
+            elif isinstance(item, h5py.Group):
+                place = h5py.h5o.get_info(item.id).addr  # a group may have several names
+                groups += [] if place in seen else [item]
+                seen.add(place)
+            if not own:
                 raise InputError(
                     f"{file.filename} is not read: its {part!r} lies in another place. Files of"
                     " torchfilm hold all their data themselves."

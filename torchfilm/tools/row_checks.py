@@ -118,16 +118,14 @@ def check_tensors(
         if value.shape != now.shape and tuple(value.shape) != (wanted := tuple(shape(name))):
             rule = f"{wanted}, one value for each cell, colony or voxel first"
             raise checks.input_error(f"shape of the field {name!r}", tuple(value.shape), rule)
-        if value.is_floating_point() != now.is_floating_point():
+        if name.startswith("out.") and not value.is_floating_point():
             raise checks.input_error(f"type of the field {name!r}", value.dtype, f"{now.dtype}")
 
 
 def check_fields(
-    fields: Mapping[str, Tensor], scopes: Mapping[str, str], rows: Mapping[str, int],
-    signals: Collection[str],
-) -> None:  # fmt: skip
-    """Raises InputError for a field that has not as many rows as its scope, and for one of
-    `signals` that is below 0, or no number, in some voxel."""
+    fields: Mapping[str, Tensor], scopes: Mapping[str, str], rows: Mapping[str, int]
+) -> None:
+    """Raises InputError for a field that has not as many rows as its scope."""
     for name, value in fields.items():
         scope = scopes[name]
         if not value.dim() or value.size(0) != rows[scope]:
@@ -137,7 +135,12 @@ def check_fields(
                 f"one value for each {'voxel' if scope == 'grid' else scope} first; the state has"
                 f" {rows['cell']} cells in {rows['colony']} colonies",
             )
-        if name in signals and bool((wrong := ~(value >= 0)).any()):
+
+
+def check_signals(fields: Mapping[str, Tensor]) -> None:
+    """Raises InputError for a signal that is below 0, or no number, in some voxel."""
+    for name, value in fields.items():
+        if name.startswith("out.") and bool((wrong := ~(value >= 0)).any()):
             bad = float(value[wrong][0])
             raise checks.input_error(f"the field {name!r}, a signal,", bad, "0 or more everywhere")
 

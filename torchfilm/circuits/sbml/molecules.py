@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import torch
+from torch import Tensor
+
 from torchfilm.circuits.equations import Equations, Term
 from torchfilm.circuits.expressions import NAME, Builder, Expression
+from torchfilm.circuits.graph import evaluated
 from torchfilm.circuits.names import Names
 from torchfilm.circuits.reactions import OUTSIDE, Reaction
 from torchfilm.circuits.sbml.algebra import over
@@ -16,6 +21,7 @@ from torchfilm.circuits.sbml.quantities import Quantities
 from torchfilm.tools.checks import InputError
 
 BACKWARDS = " backwards"
+TRIALS = 4096  # states at which the sign of a law is tried
 RATE = "rate"
 
 
@@ -37,16 +43,18 @@ class Law:
 
 
 def reactions(
-    quantities: Quantities, species: Sequence[str]
+    quantities: Quantities, species: Sequence[str], reference: Callable[[], Term]
 ) -> tuple[list[Reaction], list[Expression]]:
-    """The reactions of a model, and their rates. species: names in the circuit.
+    """The reactions of a model, and their rates. species: names in the circuit. reference: gives
+    the size of the compartment that is the cell.
 
     A law counts as it is written: what it makes of concentrations, times the molecules of a unit,
-    is the expected number of events. One that is the difference of what goes forwards and what goes
-    back becomes two reactions. Raises InputError for all that does not come in whole molecules.
+    is the expected number of events. One that can be below 0 is the difference of what goes
+    forwards and what goes back, and becomes two reactions. Raises InputError for all that does not
+    come in whole molecules.
     """
     _check(quantities)
-    found = [x for name in quantities.reactions for x in _of(quantities, name, species)]
+    found = [x for name in quantities.reactions for x in _of(quantities, name, species, reference)]
     if not found:
         raise InputError("no reaction of the model changes a species of the cells")
     return [x for x, _ in found], [rate for _, rate in found]
@@ -69,7 +77,7 @@ def _check(quantities: Quantities) -> None:
 
 
 def _of(
-    quantities: Quantities, name: str, species: Sequence[str]
+    quantities: Quantities, name: str, species: Sequence[str], reference: Callable[[], Term]
 ) -> Iterator[tuple[Reaction, Expression]]:
     """A reaction of the model as one of the circuit, or two; none if it changes nothing there."""
     reaction = quantities.reactions[name]
@@ -80,13 +88,13 @@ def _of(
     if taken == made:
         return
     b = quantities.builder
-    law = over(b, quantities.value(name), _size(quantities, name))
+    law = over(b, quantities.value(name), _size(quantities, name, reference))
     if quantities.clock:
         raise InputError(
             f"the reaction {name!r} depends on the time, which single molecules do not know: choose"
             " a method that solves rates"
         )
-    forwards, backwards = _both_ways(b, law, taken, made)
+    forwards, backwards = _both_ways(quantities, name, law)
     for rate, sides, title in ((forwards, (taken, made), name),
                                (backwards, (made, taken), name + BACKWARDS)):  # fmt: skip
         if not isinstance(rate, Expression) and rate == 0:
@@ -117,7 +125,7 @@ def _counts(quantities: Quantities, side: Any, reaction: str) -> dict[str, int]:
     return found
 
 
-def _size(quantities: Quantities, reaction: str) -> Term:
+def _size(quantities: Quantities, reaction: str, cell: Callable[[], Term]) -> Term:
     """The size over which a reaction changes concentrations; all that it changes share it."""
     one = quantities.reactions[reaction]
     sizes: dict[Term, str] = {}
@@ -133,51 +141,62 @@ def _size(quantities: Quantities, reaction: str) -> Term:
             " are in compartments of their own, or one of them is an amount: a cell has one volume,"
             " so put all into one compartment"
         )
-    if not sizes:
-        raise InputError(
-            f"the reaction {reaction!r} happens outside of cells: leave it out,"
-            f" without=({reaction!r},), and describe it in the medium"
-        )
-    return next(iter(sizes))
+    return next(iter(sizes)) if sizes else cell()
 
 
-def _both_ways(
-    b: Builder, law: Term, taken: dict[str, int], made: dict[str, int]
-) -> tuple[Term, Term]:
-    """The rate forwards and the rate back, 0 where the law is no difference of both.
-
-    1 − x/(K + x) is a difference, but no reaction goes back: what goes back depends on what the
-    reaction makes, and what goes forwards on what it takes. Where it makes or takes nothing, the
-    law itself must be the difference, as in kin − kout·a.
-    """
-    plus, minus = _parts(b, law)
-    if not isinstance(minus, Expression) or not isinstance(law, Expression):
+def _both_ways(quantities: Quantities, reaction: str, law: Term) -> tuple[Term, Term]:
+    """The rate forwards and the rate back, 0 where the law is never below 0, as 1 − x/(K + x)."""
+    if not isinstance(law, Expression) or not _can_be_negative(quantities, law):
         return law, 0.0
-    plain = law.op == "sub"
-    goes = plain if not taken else bool(set(_reads_of(plus)) & set(taken))
-    returns = plain if not made else bool(set(_reads_of(minus)) & set(made))
-    return (plus, minus) if goes and returns else (law, 0.0)
+    plus, minus = _parts(quantities, law)
+    if _none(minus) or any(
+        isinstance(x, Expression) and _can_be_negative(quantities, x) for x in (plus, minus)
+    ):
+        raise InputError(
+            f"the law of the reaction {reaction!r} can be below 0, and is no difference of two that"
+            " cannot: write it as two reactions, forwards and back"
+        )
+    return plus, minus
 
 
-def _parts(b: Builder, x: Term) -> tuple[Term, Term]:
-    """x as a difference of terms, 0 where one is missing; only sums, products and quotients by
-    terms without a difference are taken apart."""
+def _can_be_negative(quantities: Quantities, law: Expression) -> bool:
+    """Whether a law is below 0 somewhere, tried at random positive species and signals, over eight
+    orders of magnitude about 1 and about the constants, which have the model's values."""
+    constants = {f"p.{quantities.column(n)}": x for n, x in quantities.constants.items()}
+    random = np.random.default_rng(0)
+    about = [1.0, *(abs(x) for x in constants.values() if x)]
+
+    def leaf(node: Expression) -> Tensor:
+        if constants.get(node.name):  # one that was given for each colony, or is drawn, is 0 there
+            return torch.full((TRIALS,), float(constants[node.name]), dtype=torch.float64)
+        drawn = random.choice(about, TRIALS) * 10.0 ** random.uniform(-4.0, 4.0, TRIALS)
+        return torch.from_numpy(drawn)
+
+    (values,) = evaluated([law], leaf)
+    scale = values.abs()[values.isfinite()].max() if bool(values.isfinite().any()) else 0.0
+    return bool((values < -1e-12 * scale).any())
+
+
+def _parts(quantities: Quantities, x: Term) -> tuple[Term, Term]:
+    """x as a difference of terms, 0 where one is missing; what is never below 0 stays whole."""
+    b = quantities.builder
     if not isinstance(x, Expression):
         return (x, 0.0) if x >= 0 else (0.0, -x)
-    join = lambda op, *given: _joined(b, op, *given)
+    if not _can_be_negative(quantities, x):
+        return x, 0.0
     if x.op == "neg":
-        plus, minus = _parts(b, x.args[0])
+        plus, minus = _parts(quantities, x.args[0])
         return minus, plus
     if x.op in ("add", "sub"):
-        (p, m), (q, n) = (_parts(b, a) for a in x.args)
+        (p, m), (q, n) = (_parts(quantities, a) for a in x.args)
         q, n = (q, n) if x.op == "add" else (n, q)
-        return join("add", p, q), join("add", m, n)
+        return _joined(b, "add", p, q), _joined(b, "add", m, n)
     if x.op in ("mul", "div"):
-        (p, m), (q, n) = (_parts(b, a) for a in x.args)
+        (p, m), (q, n) = (_parts(quantities, a) for a in x.args)
         if _none(n):
-            return (x, 0.0) if _none(m) else (join(x.op, p, q), join(x.op, m, q))
+            return _joined(b, x.op, p, q), _joined(b, x.op, m, q)
         if _none(m) and x.op == "mul":
-            return join("mul", p, q), join("mul", p, n)
+            return _joined(b, "mul", p, q), _joined(b, "mul", p, n)
     return x, 0.0
 
 
@@ -190,10 +209,6 @@ def _joined(b: Builder, op: str, x: Term, y: Term) -> Term:
 
 def _none(x: Term) -> bool:
     return not isinstance(x, Expression) and x == 0
-
-
-def _reads_of(x: Term) -> tuple[str, ...]:
-    return _reads(x) if isinstance(x, Expression) else ()
 
 
 def _reads(x: Expression) -> tuple[str, ...]:

@@ -128,7 +128,11 @@ def _describe(
     names = {n: quantities.column(n) for n in variables}
     rates: Equations | list[Reaction]
     if given.molecules:
-        rates, read = molecules.reactions(quantities, tuple(names.values()))
+        for reaction in quantities.reactions if not marks else ():
+            if any(reaction in (c[0] for c in x) for x in quantities.changes.values()):
+                _check_place(quantities, reaction)
+        size = lambda: _reference(quantities, variables)
+        rates, read = molecules.reactions(quantities, tuple(names.values()), size)
     else:
         rates, read = _equations(quantities, names, bool(marks))
     initial = {new: _first(quantities, old, given.initial) for old, new in names.items()}
