@@ -156,13 +156,18 @@ def medium(draw: Outside, dim: int) -> tf.Medium:
     low = [-0.47 * s for s in size]
     high = [a + s for a, s in zip(low, size, strict=True)]
     corner = torch.tensor([*high, 0.1][:3], dtype=torch.float64)
+    still = {"open": tf.Open()} if not draw.flow else {}  # nothing outside is carried in
+    faces = [{**BOUNDARIES, **still}[name] for name in draw.boundary]
     return tf.Medium(
         ahl=tf.Signal(
-            diffusion=draw.diffusion, decay=draw.decay, initial=draw.start, reservoir=0.3
+            diffusion=draw.diffusion,
+            decay=draw.decay,
+            initial=draw.start,
+            reservoir=0.3 if draw.outside == "reservoir" else 0.0,
         ),
         box=(low, high),
         spacing=draw.spacing,
-        boundary=tf.BoundaryConditions(*(BOUNDARIES[name] for name in draw.boundary)),
+        boundary=tf.BoundaryConditions(*faces),
         flow=(draw.flow, 0.0) if draw.flow else None,
         outside=draw.outside,
         method=draw.method,

@@ -255,9 +255,8 @@ class GridCoverage(_MediumPart):
         same = tuple(grid.spacing) == tuple(step)
         if same and self.effect.outside != "grow":
             count = [round((b - a) / h) for a, b, h in zip(low, high, step, strict=True)]
-            same = all(shape == tuple(count) for shape in grid.shapes) and bool(
-                (grid.origin == grid.origin.new_tensor(low)).all()
-            )
+            same = all(shape == tuple(count) for shape in grid.shapes)
+            same = same and all(corner == list(low) for corner in grid.origin.tolist())
         if not same:
             raise checks.InputError(
                 f"Medium has voxels of {' × '.join(f'{h:g}' for h in step)} µm in the box {low} to"
