@@ -90,15 +90,15 @@ def infer(
 
 
 def _check_observed(observed: Any) -> None:
-    if not isinstance(observed, Observed):
-        if isinstance(observed, (list, tuple)):
-            raise tf.InputError(
-                "observed is one Observed, not a list: put data of several times together as"
-                " ObservedCourse([…])."
-            )
-        raise checks.input_error(
-            "observed", observed, "an Observed, such as Observed.from_table(…)"
+    """Raise InputError for what is no data."""
+    if isinstance(observed, (list, tuple)):
+        raise tf.InputError(
+            "observed is one Observed, not a list: put data of several times together as"
+            " ObservedCourse([…])."
         )
+    if not isinstance(observed, Observed):
+        rule = "an Observed, such as Observed.from_table(…)"
+        raise checks.input_error("observed", observed, rule)
 
 
 def _check_end(seen: float | None, cells: int | None, until: float | None) -> None:

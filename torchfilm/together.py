@@ -120,11 +120,11 @@ class Together:
             state = circuit.turn(state, dt, done, number)
         state = self.medium.transport.carried(state, dt, dt, names=frozenset(self.names))
         every = torch.ones(state.colonies, dtype=torch.int64, device=state.device)
-        noted = {}
-        for title in (c.title for c in self.circuits):
-            report: Any = state.reports[title]
-            noted[title] = replace(report, unsolved=report.unsolved + every)
-        return state.replace(reports={**state.reports, **noted})
+        reports: dict[str, Any] = dict(state.reports)
+        for circuit in self.circuits:
+            report = reports[circuit.title]
+            reports[circuit.title] = replace(report, unsolved=report.unsolved + every)
+        return state.replace(reports=reports)
 
     def _chosen(self, made: State, halved: State, again: Tensor) -> State:
         """The one state, or in these colonies (B,) the other."""

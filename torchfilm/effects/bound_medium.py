@@ -210,9 +210,7 @@ class GridCoverage(_MediumPart):
     def __init__(self, effect: Medium, binding: Binding, transport: Transport):
         super().__init__(effect, binding, transport)
         self.stage, self.title = GRID_COVERAGE, "grid coverage"
-        corner, end, size = effect.corners
-        # a box of one layer stays one layer
-        flat = [round((b - a) / h) == 1 for a, b, h in zip(corner, end, size, strict=True)]
+        flat = [count == 1 for count in effect.voxels]  # a box of one layer stays one layer
         fixed = [letter not in effect.grows for letter in "xyz"]
         self.flat, self.fixed = torch.tensor([flat, fixed], device=binding.batch.device)
         self._seen: ref[Grid] | None = None  # the grid that was checked last
@@ -232,7 +230,7 @@ class GridCoverage(_MediumPart):
     def opened(self, state: State) -> State:
         layout = state.layout
         if layout is not None and (self._seen is None or self._seen() is not layout.grid):
-            self._check_grid(state)
+            self._check_grid(layout.grid)
             self._seen = ref(layout.grid)
         return self.transport.opened(state)
 
@@ -247,15 +245,12 @@ class GridCoverage(_MediumPart):
                 f" {report.reason(place)}. {report.hint}."
             )
 
-    def _check_grid(self, state: State) -> None:
-        """Raise InputError for a state whose signals are on another grid than this medium's."""
-        if state.layout is None:
-            return
-        grid, (low, high, step) = state.layout.grid, self.effect.corners
+    def _check_grid(self, grid: Grid) -> None:
+        """Raise InputError for the grid of a state that is not this medium's."""
+        low, high, step = self.effect.corners
         same = tuple(grid.spacing) == tuple(step)
         if same and self.effect.outside != "grow":
-            count = [round((b - a) / h) for a, b, h in zip(low, high, step, strict=True)]
-            same = all(shape == tuple(count) for shape in grid.shapes)
+            same = all(shape == self.effect.voxels for shape in grid.shapes)
             same = same and all(corner == list(low) for corner in grid.origin.tolist())
         if not same:
             raise checks.InputError(

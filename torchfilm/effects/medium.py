@@ -230,6 +230,11 @@ class Medium(Effect):
         return (*low, self.height - depth / 2), (*high, self.height + depth / 2), (x, y, depth)
 
     @property
+    def voxels(self) -> tuple[int, ...]:
+        """How many there are along the three axes."""
+        return tuple(round((b - a) / h) for a, b, h in zip(*self.corners, strict=True))
+
+    @property
     def carries_in_turns(self) -> bool:
         """Whether it is given what only transport in turns has: a method, or a splitting."""
         return self.method is not None or self.splitting != "strang"

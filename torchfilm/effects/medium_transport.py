@@ -70,12 +70,11 @@ class Transport:
 
     def lay(self, state: State) -> State:
         """The state with one grid per colony, as `box` and `spacing` give it."""
-        low, high, step = self.medium.corners
-        count = [round((b - a) / h) for a, b, h in zip(low, high, step, strict=True)]
+        low, _, step = self.medium.corners
         size = (state.colonies, 3)
         grid = Grid(
             torch.tensor(low, dtype=torch.float64, device=state.device).expand(size).clone(),
-            torch.tensor(count, device=state.device).expand(size).clone(),
+            torch.tensor(self.medium.voxels, device=state.device).expand(size).clone(),
             step,
         )
         return state.replace(layout=Layout(grid, **self.space))

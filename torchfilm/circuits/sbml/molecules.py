@@ -87,8 +87,8 @@ def _of(
     )
     if taken == made:
         return
-    b = quantities.builder
-    law = over(b, quantities.value(name), _size(quantities, name, reference))
+    size = _size(quantities, name, reference)
+    law = over(quantities.builder, quantities.value(name), size)
     if quantities.clock:
         raise InputError(
             f"the reaction {name!r} depends on the time, which single molecules do not know: choose"
@@ -97,10 +97,9 @@ def _of(
     forwards, backwards = _both_ways(quantities, name, law)
     for rate, sides, title in ((forwards, (taken, made), name),
                                (backwards, (made, taken), name + BACKWARDS)):  # fmt: skip
-        if not isinstance(rate, Expression) and rate == 0:
+        if _none(rate):
             continue
-        whole = calculate(b, "mul", quantities.choices.per_hour, rate)
-        whole = whole if isinstance(whole, Expression) else b.number(float(whole))
+        whole = quantities.per_hour(rate)
         equations = Equations.of(title, tuple(species), {RATE: whole}, {})
         yield Reaction(*sides, Law(equations, _reads(whole)), title), whole
 

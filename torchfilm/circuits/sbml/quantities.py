@@ -261,6 +261,12 @@ class Quantities:
             self._known[key] = self._guarded(key, name, lambda: self._rate(name))
         return numeric(self.builder, self._known[key])
 
+    def per_hour(self, rate: Term) -> Expression:
+        """A rate in the model's time as one per hour."""
+        b, factor = self.builder, self.choices.per_hour
+        made = rate if factor == 1 else calculate(b, "mul", factor, rate)
+        return made if isinstance(made, Expression) else b.number(float(made))
+
     def _rate(self, name: str) -> Term:
         b = self.builder
         if name in self.driven:

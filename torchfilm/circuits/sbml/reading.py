@@ -159,7 +159,7 @@ def _equations(
 ) -> tuple[Equations, list[Expression]]:
     """The rates of the variables, by their names in the circuit, and of signals, and all of them as
     expressions."""
-    rates = {n: _per_hour(quantities, quantities.rate(n)) for n in names}
+    rates = {n: quantities.per_hour(quantities.rate(n)) for n in names}
     releases = dict(_releases(quantities, tuple(names), ours))
     species = dict(names)
     if quantities.clock:
@@ -263,12 +263,6 @@ def _ordered(quantities: Quantities) -> list[str]:
     return sorted(found, key=lambda n: quantities.things[n][0] != SPECIES)
 
 
-def _per_hour(quantities: Quantities, rate: float | Expression) -> Expression:
-    b, factor = quantities.builder, quantities.choices.per_hour
-    made = rate if factor == 1 else calculate(b, "mul", factor, rate)
-    return made if isinstance(made, Expression) else b.number(float(made))
-
-
 def _releases(
     quantities: Quantities, variables: Sequence[str], ours: bool
 ) -> Iterator[tuple[str, Expression]]:
@@ -295,7 +289,7 @@ def _releases(
         else:
             total = calculate(b, "mul", quantities.gained(name, size), volume)
         assert isinstance(total, (float, int, Expression))
-        yield quantities.choices.signals[name], _per_hour(quantities, total)
+        yield quantities.choices.signals[name], quantities.per_hour(total)
 
 
 def _check_place(quantities: Quantities, reaction: str) -> None:
