@@ -12,10 +12,11 @@ from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
-from torchfilm.effects.medium import Medium, Signal
+from torchfilm.effects.medium import Medium
 from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
+from torchfilm.effects.signal import Signal
 from torchfilm.initial_cells import Cells
 from torchfilm.inocula import inoculum
 from torchfilm.loop import advance, failures
@@ -30,6 +31,7 @@ from torchfilm.signals.boundary_conditions import (
     Open,
     Periodic,
 )
+from torchfilm.signals.schedule import Schedule
 from torchfilm.simulation import rollout, simulate
 from torchfilm.state import Field, State
 from torchfilm.tools import checks, displays, progress, tables, tangents
@@ -99,6 +101,7 @@ __all__ = [
     "Results",
     "Rules",
     "Scene",
+    "Schedule",
     "Settings",
     "Signal",
     "SimulationError",

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
+from torchfilm.signals.schedule import Schedule
 from torchfilm.tools import checks
 
 if TYPE_CHECKING:
@@ -93,6 +94,12 @@ def checked(name: str, given: object, rule: Rule, forms: str = FORMS) -> Any:
     Raises InputError for what `rule` does not allow; forms: those that a value of a cell may take.
     """
     bounds: dict[str, Any] = {"above": rule.above, "least": rule.least, "most": rule.most}
+    if isinstance(given, Schedule):
+        hint = (
+            "A Schedule is for the source, flow, reservoir and faces of a Medium; rates and rules"
+            " take its value as schedule(cell.time)."
+        )
+        raise checks.input_error(name, given, "constant", hint)
     if isinstance(given, ByType):
         given = given.values
     if isinstance(given, (Distribution, Mapping)) and rule.scope == COLONY:

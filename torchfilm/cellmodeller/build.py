@@ -21,7 +21,8 @@ from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
-from torchfilm.effects.medium import Medium, Signal
+from torchfilm.effects.medium import Medium
+from torchfilm.effects.signal import Signal
 from torchfilm.initial_cells import Cells
 from torchfilm.physics.walls import Plane, Sphere, Wall
 from torchfilm.scene import Scene

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,67 +19,23 @@ from torchfilm.effects.bound_medium import (
     GridCoverage,
 )
 from torchfilm.effects.medium_transport import EXACT, Transport
+from torchfilm.effects.signal import Flow, Signal, check_boundary, velocity
 from torchfilm.parameters import number_range
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Open
 from torchfilm.signals.exchange import turns_error
-from torchfilm.signals.space import check_used, checked_box, checked_flow
+from torchfilm.signals.schedule import Schedule, each_value
+from torchfilm.signals.space import check_used, checked_box
 from torchfilm.signals.transport import COMPILED, METHODS
 from torchfilm.signals.transport_series import MOST
 from torchfilm.state import COLONY, GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import check_backend, why_torch
-from torchfilm.values import CONCENTRATION, PerColony, Rule, checked
+from torchfilm.tools.warn_once import warn
+from torchfilm.values import CONCENTRATION
 
-# A value on the grid: a number, one per colony, or a function from positions (M, 3) µm to (M,).
-OnGrid = float | Tensor | Callable[[Tensor], Tensor]
-# A velocity: two or three numbers (or one per colony each), or a function from positions (M, 3) µm
-# to velocities (M, 3).
-Flow = Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
 OUTSIDE_CELLS = ("error", "grow", "reservoir")
 EXCHANGES = ("turns", "together")
 SPLITTINGS = ("lie", "strang")
-
-
-def _bare(flow: Any) -> Any:
-    """A velocity whose components for each colony are plain numbers."""
-    if not isinstance(flow, (tuple, list)):
-        return flow
-    return tuple(v.values if isinstance(v, PerColony) else v for v in flow)
-
-
-@dataclass(frozen=True, eq=False)
-class Signal(metaclass=checks.KnownKeywords):
-    """A substance outside the cells.
-
-    diffusion: K, µm²/h, one number or one per colony. decay: 1/h. initial: concentration at the
-    start. source: production, concentration/h. Each of these three is one number, one per colony,
-    or a function from positions (M, 3) µm to (M,). boundary, flow: faces of the box, and velocity,
-    µm/h, if they differ from the medium's. reservoir: the concentration outside an open box, one
-    number or one per colony.
-    """
-
-    diffusion: float | Tensor
-    decay: OnGrid = 0.0
-    initial: OnGrid = 0.0
-    source: OnGrid = 0.0
-    boundary: BoundaryConditions | None = None
-    flow: Flow = None
-    reservoir: float | Tensor = 0.0
-
-    instead: ClassVar[Mapping[str, str]] = {
-        "D": "Did you mean diffusion?",
-        "K": "Did you mean diffusion?",
-    }
-
-    def __post_init__(self) -> None:
-        _check_boundary("Signal.boundary", self.boundary)
-        rule = Rule(scope="colony", least=0.0)
-        for name in ("diffusion", "reservoir", "decay", "initial", "source"):
-            given = getattr(self, name)
-            if name in ("diffusion", "reservoir") or not callable(given):
-                made = checked(f"Signal.{name}", given, rule)
-                object.__setattr__(self, name, made.values if isinstance(made, PerColony) else made)
-        object.__setattr__(self, "flow", checked_flow("Signal.flow", _bare(self.flow)))
 
 
 @dataclass(frozen=True, init=False, eq=False)
@@ -125,7 +81,7 @@ class Medium(Effect):
     depth: float | None = None
     height: float = 0.0
     boundary: BoundaryConditions | None = None
-    flow: Flow = None
+    flow: Flow | Schedule = None
     obstacles: Callable[[Tensor], Tensor] | None = None
     outside: str = "error"
     grows: str = "xyz"
@@ -149,7 +105,7 @@ class Medium(Effect):
         depth: float | None = None,
         height: float = 0.0,
         boundary: BoundaryConditions | None = None,
-        flow: Flow = None,
+        flow: Flow | Schedule = None,
         obstacles: Callable[[Tensor], Tensor] | None = None,
         outside: str = "error",
         grows: str = "xyz",
@@ -173,7 +129,7 @@ class Medium(Effect):
             "depth": depth,
             "height": float(height),
             "boundary": boundary,
-            "flow": checked_flow("Medium.flow", _bare(flow)),
+            "flow": velocity("Medium.flow", flow),
             "obstacles": obstacles,
             "outside": outside,
             "grows": grows,
@@ -214,7 +170,7 @@ class Medium(Effect):
             else BoundaryConditions(Open(), Open(), Open())
         )
 
-    def flow_of(self, name: str) -> Flow:
+    def flow_of(self, name: str) -> Flow | Schedule:
         """The velocity that carries a signal, or None."""
         own = self.signals[name].flow
         return self.flow if own is None else own
@@ -276,6 +232,28 @@ class Medium(Effect):
         values += [signal.reservoir] if self.outside == "reservoir" else []
         return any(not isinstance(x, (int, float)) or x != 0 for x in values)
 
+    def check_step(self, dt: float, divides: bool) -> None:
+        for what, schedule in self._scheduled().items():
+            moments = (*schedule.times, schedule.period or 0.0)
+            between = [t for t in moments if abs(t / dt - round(t / dt)) > 1e-6]
+            if between:
+                warn(
+                    f"the Schedule of {what} changes at {between[0]:g} h, within a step of {dt:g}"
+                    " h: its value holds from the next step on. Let the times, and the period, be"
+                    " multiples of dt."
+                )
+
+    def _scheduled(self) -> dict[str, Schedule]:
+        """The schedules, by what they are of."""
+        given: dict[str, Any] = {}
+        for name, signal in self.signals.items():
+            given |= {f"source of {name}": signal.source, f"flow of {name}": self.flow_of(name)}
+            given[f"reservoir of {name}"] = signal.reservoir
+            for axis, pair in zip("xyz", self.boundary_of(name).pairs, strict=True):
+                for end, face in zip(("low", "high"), pair, strict=True):
+                    given[f"the {end} face along {axis} of {name}"] = face.outside_value()
+        return {what: x for what, x in given.items() if isinstance(x, Schedule)}
+
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         transport = Transport(self, binding)
         main = BoundMedium(self, binding, transport)
@@ -314,6 +292,7 @@ class Medium(Effect):
         if exchanged and self.steps > 1:
             names = ", ".join(sorted(exchanged))
             lines.append(f"{self.steps} turns of cells and transport in a step, for {names}")
+        lines += [f"{what} {x.told}" for what, x in self._scheduled().items()]
         lines += [f"{n}: moved together with {coupled[n]}, see there" for n in sorted(coupled)]
         for name, signal in self.signals.items():
             if name in coupled:
@@ -363,7 +342,9 @@ class Medium(Effect):
             return self.method, "as given"
         found = {
             "obstacles": self.obstacles is not None,
-            "a flow that differs from place to place": callable(self.flow_of(name)),
+            "a flow that differs from place to place": any(
+                map(callable, each_value(self.flow_of(name)))
+            ),
             "a decay that differs from place to place": callable(self.signals[name].decay),
         }
         against = [words for words, there in found.items() if there]
@@ -406,16 +387,6 @@ def _check_signals(signals: Mapping[str, Any]) -> None:
             )
 
 
-def _check_boundary(name: str, given: object) -> None:
-    if given is not None and not isinstance(given, BoundaryConditions):
-        raise checks.input_error(
-            name,
-            given,
-            "BoundaryConditions",
-            "Write boundary=tf.BoundaryConditions(x=tf.Open(), y=tf.NoFlux()).",
-        )
-
-
 def _check_medium(
     boundary: object,
     outside: str,
@@ -425,7 +396,7 @@ def _check_medium(
     splitting: str,
     obstacles: object,
 ) -> None:
-    _check_boundary("Medium.boundary", boundary)
+    check_boundary("Medium.boundary", boundary)
     checks.choice("Medium.outside", outside, OUTSIDE_CELLS)
     if not isinstance(grows, str) or not grows or set(grows) - set("xyz"):
         raise checks.input_error(

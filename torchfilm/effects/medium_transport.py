@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -17,6 +18,7 @@ from torchfilm.resolver import snapshot
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.grid import Grid, GridBatch
 from torchfilm.signals.layout import Layout
+from torchfilm.signals.schedule import at_time, each_value, schedules
 from torchfilm.signals.transport import Carrier, carry, check_method, choose, prepare
 from torchfilm.signals.transport_operator import Operator
 from torchfilm.signals.transport_rates import build_operator
@@ -27,10 +29,41 @@ from torchfilm.tools.backends import why_torch
 from torchfilm.tools.tangents import tracked
 
 if TYPE_CHECKING:
-    from torchfilm.effects.medium import Flow, Medium, OnGrid, Signal
+    from torchfilm.effects.medium import Medium
+    from torchfilm.effects.signal import Flow, OnGrid, Signal
 
 # Methods that are exact over a step, whatever its length.
 EXACT = ("exponential", "series")
+
+
+@dataclass(frozen=True, eq=False)
+class Constants:
+    """What a medium is given, by the name of a signal, on the batch's device, while no schedule
+    goes on. place: of the value of each schedule."""
+
+    medium: Medium
+    place: tuple[int, ...]
+    signals: dict[str, Signal]
+    flows: dict[str, Flow]
+    boundary: dict[str, BoundaryConditions]
+
+    @cached_property
+    def space(self) -> dict[str, Any]:
+        """What of a layout the scene decides, whatever grid a state has."""
+        reservoir = {name: s.reservoir for name, s in self.signals.items()}
+        return {
+            "periodic": self.boundary[next(iter(self.signals))].periodic,
+            "height": self.medium.height,
+            "obstacle": self.medium.obstacles,
+            "reservoir": reservoir if self.medium.outside == "reservoir" else None,
+        }
+
+    def numbers(self, name: str) -> list[Any]:
+        """The values that a signal's transport depends on; some are tensors."""
+        signal, flow = self.signals[name], self.flows[name]
+        faces = [face.outside_value() for pair in self.boundary[name].pairs for face in pair]
+        moving = [] if callable(flow) else list(flow or ())
+        return [signal.diffusion, signal.decay, signal.source, *faces, *moving]
 
 
 class Transport:
@@ -40,26 +73,17 @@ class Transport:
         self.medium, batch = medium, binding.batch
         self.by_torch = why_torch("Medium", medium.backend, batch.device)
         self.compiled = not self.by_torch
-        self.signals: dict[str, Signal] = snapshot(medium.signals, "Medium.signals", batch)
-        self.flows: dict[str, Flow] = {
-            n: snapshot(medium.flow_of(n), f"flow of the signal {n!r}", batch)
-            for n in medium.signals
+        signals = snapshot(medium.signals, "Medium.signals", batch)
+        flows = {
+            n: snapshot(medium.flow_of(n), f"flow of the signal {n!r}", batch) for n in signals
         }
-        self.boundary: dict[str, BoundaryConditions] = {
+        boundary = {
             n: snapshot(medium.boundary_of(n), f"boundary of the signal {n!r}", batch)
-            for n in medium.signals
+            for n in signals
         }
-        # what of a layout the scene decides, whatever grid a state has
-        self.space: dict[str, Any] = {
-            "periodic": self.boundary[next(iter(self.signals))].periodic,
-            "height": medium.height,
-            "obstacle": medium.obstacles,
-            "reservoir": (
-                {name: s.reservoir for name, s in self.signals.items()}
-                if medium.outside == "reservoir"
-                else None
-            ),
-        }
+        self._given = signals, flows, boundary
+        self.schedules = list(schedules(self._given))
+        self._known: dict[tuple[int, ...], Constants] = {}
         # signals that take turns with circuits, in the medium's steps; that others move, by whom
         self.in_turns: frozenset[str] = frozenset()
         self.coupled: dict[str, str] = {}
@@ -77,23 +101,32 @@ class Transport:
             torch.tensor(self.medium.voxels, device=state.device).expand(size).clone(),
             step,
         )
-        return state.replace(layout=Layout(grid, **self.space))
+        return state.replace(layout=Layout(grid, **self.at(state.time).space))
+
+    def at(self, time: float) -> Constants:
+        """What holds at a time, h."""
+        place = tuple(x.place(time) for x in self.schedules)
+        if place not in self._known:
+            parts = at_time(self._given, time) if place else self._given
+            self._known[place] = Constants(self.medium, place, *parts)
+        return self._known[place]
 
     def opened(self, state: State) -> State:
         """The state in the space of this medium, also where another model laid its grid."""
         layout = state.layout
         # the same layout where nothing differs: it keeps what it has found out about its grid
-        if layout is None or all(getattr(layout, n) is v for n, v in self.space.items()):
+        space = self.at(state.time).space
+        if layout is None or all(getattr(layout, n) is v for n, v in space.items()):
             return state
-        return state.replace(layout=dataclasses.replace(layout, **self.space))
+        return state.replace(layout=dataclasses.replace(layout, **space))
 
     def first(self, name: str) -> Callable[[State, Tensor], Tensor]:
         """The first values of a signal, as a field's `initial`."""
-        return partial(_first_values, self.signals[name], name)
+        return partial(_first_values, self.at(0.0).signals[name], name)
 
     def values(self, name: str, what: str, state: State) -> Tensor:
         """The initial, source or decay of a signal on every voxel, (nodes,); 0 in obstacles."""
-        return _on_grid(self.signals[name], name, what, state)
+        return _on_grid(self.at(state.time).signals[name], name, what, state)
 
     def carried(
         self,
@@ -109,7 +142,9 @@ class Transport:
         assert state.layout is not None
         grid, steps = state.layout.grid, self.medium.steps
         changed = {}
-        for name in sorted(self.signals.keys() - self.coupled.keys() if names is None else names):
+        for name in sorted(
+            self.medium.signals.keys() - self.coupled.keys() if names is None else names
+        ):
             often = name in self.in_turns
             whole, count = (turn, pieces) if often else (hours, steps)
             count = 1 if often and self.medium.method_of(name)[0] in EXACT else count
@@ -126,9 +161,9 @@ class Transport:
         they stay."""
         assert state.layout is not None
         grid = state.layout.grid
-        key = (name, state.dtype, torch.is_grad_enabled())
+        key = (name, self.at(state.time).place, state.dtype, torch.is_grad_enabled())
         known = self._eaten.setdefault(grid, {})
-        if key in known and not self._tracked(name):
+        if key in known and not self._tracked(name, state):
             return known[key]
         made = [
             UptakeTransport(self._operator(name, state, b), b.shape, self.compiled)
@@ -144,21 +179,24 @@ class Transport:
         them."""
         return max(float(x.operator.loss.amax()) for x in self.with_uptake(name, state))
 
-    def _tracked(self, name: str) -> bool:
+    def _tracked(self, name: str, state: State) -> bool:
         """Whether derivatives by what a signal's transport depends on are wanted."""
-        numbers = [x for x in self._numbers(name) if isinstance(x, Tensor)]
-        return tracked(*numbers, *_closure_tensors(self.signals[name], self.flows[name]))
+        now = self.at(state.time)
+        numbers = [x for x in now.numbers(name) if isinstance(x, Tensor)]
+        return tracked(*numbers, *_closure_tensors(now.signals[name], now.flows[name]))
 
     def carrier(self, name: str, state: State, batch: GridBatch, dt: float) -> Carrier:
         """The step of a signal on grids of one shape; it is reused while the grids stay."""
         assert state.layout is not None
-        if self._tracked(name):
-            kept, own = {} if self._of_step is None else self._of_step, (name, batch.shape, dt)
+        place = self.at(state.time).place
+        if self._tracked(name, state):
+            kept = {} if self._of_step is None else self._of_step
+            own = (name, place, batch.shape, dt)
             if own not in kept:
                 kept[own] = self._prepare(name, state, batch, dt)[0]
             return kept[own]
         known = self.carriers.setdefault(state.layout.grid, {})
-        key = (name, batch.shape, dt, state.dtype, torch.is_grad_enabled())
+        key = (name, place, batch.shape, dt, state.dtype, torch.is_grad_enabled())
         found = known.get(key)
         if found is None:
             found, differentiable = self._prepare(name, state, batch, dt)
@@ -177,24 +215,20 @@ class Transport:
         finally:
             self._of_step = None
 
-    def _numbers(self, name: str) -> list[Any]:
-        """The values that a signal's transport depends on; some are tensors."""
-        signal, flow = self.signals[name], self.flows[name]
-        faces = [face.outside_value() for pair in self.boundary[name].pairs for face in pair]
-        moving = [] if callable(flow) else list(flow or ())
-        return [signal.diffusion, signal.decay, signal.source, *faces, *moving]
-
     def check(self, name: str, state: State) -> None:
         """Raise InputError for a signal whose rates or method cannot be."""
         assert state.layout is not None
         self._check_range(name, state.dtype)
-        check_method(self._operator(name, state, state.layout.grid.batches[0]), self.medium.method)
+        for time in sorted({state.time, *(t for x in self.schedules for t in x.times)}):
+            then, first = state.replace(time=time), state.layout.grid.batches[0]
+            check_method(self._operator(name, then, first), self.medium.method)
 
     def _check_range(self, name: str, dtype: torch.dtype) -> None:
         """Raise InputError for a number that would be infinite in the states' type."""
-        signal, most = self.signals[name], torch.finfo(dtype).max
-        given = {n: getattr(signal, n) for n in ("initial", "source", "decay", "reservoir")}
-        for what, value in given.items():
+        signal, most = self._given[0][name], torch.finfo(dtype).max
+        names = ("initial", "source", "decay", "reservoir")
+        given = [(n, value) for n in names for value in each_value(getattr(signal, n))]
+        for what, value in given:
             if callable(value):
                 continue
             greatest = float(torch.as_tensor(value, dtype=torch.float64).detach().max())
@@ -221,7 +255,8 @@ class Transport:
         return Carrier(stepper, batch.shape, self.compiled and not wanted), wanted
 
     def _operator(self, name: str, state: State, batch: GridBatch) -> Operator:
-        signal, layout = self.signals[name], state.layout
+        now, layout = self.at(state.time), state.layout
+        signal = now.signals[name]
         assert layout is not None
         ids = state.colony_id.index_select(0, batch.colonies)
         own = lambda x: (
@@ -237,8 +272,8 @@ class Transport:
             layout.grid.spacing,
             diffusion=own(signal.diffusion),
             decay=spread("decay"),
-            velocity=_velocity(self.flows[name], layout, batch, own),
-            boundary=self.boundary[name].take(ids),
+            velocity=_velocity(now.flows[name], layout, batch, own),
+            boundary=now.boundary[name].take(ids),
             mask=None if layout.mask is None else batch.of(layout.mask),
             source=(
                 None
@@ -293,8 +328,8 @@ def _on_grid(signal: Signal, name: str, what: str, state: State) -> Tensor:
             found = given(layout.grid.centres())
         except TypeError as error:
             raise checks.InputError(
-                f"{label} cannot be called: {error}. It takes positions (nodes, 3), µm, alone; for"
-                " what changes in time simulate on from a state with another scene."
+                f"{label} cannot be called: {error}. It takes positions (nodes, 3), µm, alone. What"
+                " changes in time is a tf.Schedule of functions."
             ) from error
         if not isinstance(found, Tensor) or found.shape != (layout.grid.nodes,):
             shown = tuple(found.shape) if isinstance(found, Tensor) else found

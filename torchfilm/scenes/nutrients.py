@@ -8,8 +8,9 @@ from torchfilm.distributions import Uniform
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
-from torchfilm.effects.medium import Medium, Signal
+from torchfilm.effects.medium import Medium
 from torchfilm.effects.nutrition import Monod
+from torchfilm.effects.signal import Signal
 from torchfilm.scene import Scene
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Dirichlet
 

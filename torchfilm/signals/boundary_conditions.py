@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 from torch import Tensor
 
+from torchfilm.signals.schedule import Schedule, checked_values
 from torchfilm.tools import checks
 
 AXES = "xyz"
@@ -15,8 +18,9 @@ AXES = "xyz"
 class Face(metaclass=checks.KnownKeywords):
     """The base of all faces."""
 
-    def outside_value(self) -> float | Tensor:
-        """The concentration beyond the face, one number or one per colony; 0 where none enters."""
+    def outside_value(self) -> float | Tensor | Schedule:
+        """The concentration beyond the face, one number or one per colony, or a schedule of them; 0
+        where none enters."""
         return 0.0
 
     def take(self, colonies: Tensor) -> Face:
@@ -36,17 +40,18 @@ class Periodic(Face):
 
 @dataclass(frozen=True)
 class Dirichlet(Face):
-    """The concentration at the face itself is `value` ≥ 0: one number or one per colony.
+    """The concentration at the face itself is `value` ≥ 0: one number or one per colony, or a
+    `Schedule` of them.
 
     The face is half a voxel from the nearest centre.
     """
 
-    value: float | Tensor
+    value: float | Tensor | Schedule
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "value", checks.value("Dirichlet.value", self.value, least=0.0))
+        object.__setattr__(self, "value", _checked("Dirichlet.value", self.value))
 
-    def outside_value(self) -> float | Tensor:
+    def outside_value(self) -> float | Tensor | Schedule:
         return self.value
 
     def take(self, colonies: Tensor) -> Face:
@@ -57,15 +62,15 @@ class Dirichlet(Face):
 class Open(Face):
     """No diffusive flux; the flow carries the local concentration out, and `outside` in.
 
-    outside: ≥ 0, one number or one per colony.
+    outside: ≥ 0, one number or one per colony, or a `Schedule` of them.
     """
 
-    outside: float | Tensor = 0.0
+    outside: float | Tensor | Schedule = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "outside", checks.value("Open.outside", self.outside, least=0.0))
+        object.__setattr__(self, "outside", _checked("Open.outside", self.outside))
 
-    def outside_value(self) -> float | Tensor:
+    def outside_value(self) -> float | Tensor | Schedule:
         return self.outside
 
     def take(self, colonies: Tensor) -> Face:
@@ -124,7 +129,11 @@ class BoundaryConditions(metaclass=checks.KnownKeywords):
         return BoundaryConditions(x, y, z)
 
 
-def _take(given: float | Tensor, colonies: Tensor) -> float | Tensor:
+def _checked(name: str, given: Any) -> Any:
+    return checked_values(name, given, partial(checks.value, least=0.0))
+
+
+def _take(given: Any, colonies: Tensor) -> Any:
     return (
         given.to(colonies.device).index_select(0, colonies)
         if isinstance(given, Tensor) and given.dim() == 1

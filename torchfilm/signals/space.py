@@ -8,6 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from torchfilm.signals.boundary_conditions import Open
+from torchfilm.signals.schedule import Schedule, each_value
 from torchfilm.tools import checks
 from torchfilm.tools.warn_once import warn
 
@@ -122,5 +123,6 @@ def check_used(medium: Any) -> None:
             )
 
 
-def _given(value: float | Tensor) -> bool:
-    return bool((value != 0).any()) if isinstance(value, Tensor) else value != 0
+def _given(value: float | Tensor | Schedule) -> bool:
+    """Whether some of a value is not 0."""
+    return any(bool((x != 0).any()) if isinstance(x, Tensor) else x != 0 for x in each_value(value))

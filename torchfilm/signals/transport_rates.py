@@ -21,6 +21,7 @@ from torchfilm.signals.boundary_conditions import (
     Periodic,
 )
 from torchfilm.signals.grid import Shape
+from torchfilm.signals.schedule import Schedule
 from torchfilm.signals.transport_operator import Exchange, Operator
 from torchfilm.tools import checks
 
@@ -129,6 +130,7 @@ def _exchange(
 def _has_inflow(face: Face) -> bool:
     """Whether the concentration beyond the face may be above 0."""
     outside = face.outside_value()
+    assert not isinstance(outside, Schedule)  # a medium gives what holds in a step
     return isinstance(outside, Tensor) or outside > 0
 
 

@@ -1,0 +1,223 @@
+"""Media whose sources, faces, flow and reservoirs change at given times, and inputs of rates and
+rules that do."""
+
+import math
+import warnings
+
+import pytest
+import torch
+
+import torchfilm as tf
+
+BOX = {"box": ((-32, -32), (32, 32)), "spacing": 4.0}
+F64 = {"dtype": torch.float64}
+PULSE = {0: 1.0, 0.5: 0.0, 0.75: 2.0}
+
+
+def runs(scene, until, state=None, dt=0.05, **batch):
+    """The last state."""
+    first = scene.bind(**batch).start() if state is None else state
+    *_, last = tf.simulate(scene, first, until=until, dt=dt)
+    return last
+
+
+def grown(medium, *effects):
+    """A colony that eats, in a medium."""
+    return tf.Scene(
+        *effects or (tf.Monod("food", rate=1.0, half=0.1),), tf.Growth(), tf.Division(length=4.0),
+        tf.Mechanics(dim=2), medium,
+        founders=tf.Cells([[0.0, 0.0], [20.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]]),
+    )  # fmt: skip
+
+
+def medium(value, where, **more):
+    """A medium that is given a value (or a schedule of them) at one of the places that take one."""
+    signal, faces = {"diffusion": 500.0, "initial": 0.2}, {}
+    if where == "face":
+        faces["boundary"] = tf.BoundaryConditions(x=(tf.Dirichlet(value), tf.NoFlux()))
+    elif where == "open":
+        faces |= {"boundary": tf.BoundaryConditions(x=tf.Open(value)), "flow": (60.0, 0.0)}
+    elif where == "flow":
+        flow = lambda x: (40.0 * x, 10.0)
+        faces["boundary"] = tf.BoundaryConditions(x=tf.Open(1.0), y=tf.Periodic())
+        if isinstance(value, tf.Schedule):
+            faces["flow"] = tf.Schedule({t: flow(x) for t, x in value.values.items()})
+        else:
+            faces["flow"] = flow(value)
+    elif where == "reservoir":
+        signal |= {"reservoir": value}
+        faces |= {"outside": "reservoir", "boundary": tf.BoundaryConditions(x=tf.Dirichlet(0.5))}
+    else:
+        signal |= {"source": value}
+    box = {"box": ((-12, -32), (12, 32)), "spacing": 4.0} if where == "reservoir" else BOX
+    return tf.Medium(food=tf.Signal(**signal), **faces, **box, **more)
+
+
+@pytest.mark.parametrize("more", [{}, {"backend": "torch"}, {"splitting": "lie"}])
+def test_what_a_source_gives_is_exact_for_each_colony(more):
+    decay, second = 0.7, torch.tensor([1.0, 3.0], dtype=torch.float64)
+    source = tf.Schedule({0: 0.25, 1: tf.PerColony([1.0, 3.0]), 1.5: 0.0})
+    food = tf.Signal(diffusion=100.0, decay=decay, source=source)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # nothing grows
+        scene = tf.Scene(tf.Growth(), tf.Mechanics(dim=2), tf.Medium(food=food, **BOX, **more))
+    end = runs(scene, 2.0, colonies=2, **F64)
+    expected = torch.zeros(2, dtype=torch.float64)
+    for hours, q in ((1.0, 0.25), (0.5, second), (0.5, 0.0)):
+        kept = math.exp(-decay * hours)
+        expected = expected * kept + q / decay * (1 - kept)
+    found = end.signals["food"].reshape(2, -1)
+    torch.testing.assert_close(found, expected.unsqueeze(1).expand_as(found), rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+@pytest.mark.parametrize("where", ["face", "open", "flow", "reservoir", "source"])
+def test_a_schedule_is_a_run_in_pieces(where, backend):
+    scheduled = grown(medium(tf.Schedule(PULSE), where, backend=backend))
+    state = None
+    for value, until in zip(PULSE.values(), (0.5, 0.75, 1.25), strict=True):
+        state = runs(grown(medium(value, where, backend=backend)), until, state, **F64)
+    assert_equal(runs(scheduled, 1.25, **F64), state)
+    constant = runs(grown(medium(1.0, where, backend=backend)), 1.25, **F64)
+    assert not torch.equal(constant.length, state.length)
+
+
+def assert_equal(found, expected):
+    """Two states, to the bit."""
+    for name, value in expected.fields.items():
+        assert torch.equal(found.fields[name], value), name
+
+
+def leak(u, s, p, cell):
+    """Cells that take food up, and make a dye of it."""
+    eats = p.eats * s.food / (0.1 + s.food) * cell.volume
+    return {"dye": eats / cell.volume - u.dye}, {"food": -eats}
+
+
+@pytest.mark.parametrize("exchange", ["together", "turns"])
+def test_circuits_meet_it_too(exchange):
+    eating = tf.Circuit(leak, species="dye", eats=2.0)
+    scene = lambda value: grown(medium(value, "face", exchange=exchange), eating)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # nothing grows
+        state = None
+        for value, until in zip(PULSE.values(), (0.5, 0.75, 1.25), strict=True):
+            state = runs(scene(value), until, state, **F64)
+        assert_equal(runs(scene(tf.Schedule(PULSE)), 1.25, **F64), state)
+
+
+def test_it_begins_again_after_its_period():
+    again = tf.Schedule({0: 1.0, 0.25: 0.0}, period=0.5)
+    long = tf.Schedule({0: 1.0, 0.25: 0.0, 0.5: 1.0, 0.75: 0.0, 1.0: 1.0})
+    found, expected = (runs(grown(medium(x, "face")), 1.25, **F64) for x in (again, long))
+    assert_equal(found, expected)
+    assert [again.at(t) for t in (0, 0.2, 0.25, 0.4999, 0.5, 100.0, 100.25)] == [
+        1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0
+    ]  # fmt: skip
+    assert again.at(sum([0.05] * 5)) == 0.0  # 0.25, to rounding
+
+
+def test_a_restart_takes_the_value_of_its_time():
+    scene = grown(medium(tf.Schedule(PULSE), "face"))
+    half = runs(scene, 0.6)
+    assert_equal(runs(scene, 1.25, half), runs(scene, 1.25))
+
+
+def test_derivatives_by_each_value():
+    first, second = (torch.tensor(x, requires_grad=True, **F64) for x in (1.0, 0.5))
+
+    def amount(one, two):
+        value = tf.Schedule({0: one, 0.5: two})
+        scene = tf.Scene(tf.Monod("food", rate=1.0), tf.Growth(), medium(value, "face"), dim=2)
+        return runs(scene, 0.75, **F64).signals["food"].sum()
+
+    amount(first, second).backward()
+    for k, x in enumerate((first, second)):
+        moved = [[1.0, 0.5], [1.0, 0.5]]
+        moved[0][k] -= 1e-5
+        moved[1][k] += 1e-5
+        low, high = (float(amount(*pair)) for pair in moved)
+        assert float(x.grad) == pytest.approx((high - low) / 2e-5, rel=1e-5)
+        assert abs(float(x.grad)) > 0.1
+
+
+def test_recorded_growth_meets_it():
+    """What reads the signal changes neither growth nor motion, so growth can be recorded."""
+    reading = tf.Circuit(lambda u, s, p, cell: {"dye": s.food - u.dye}, species="dye")
+    scene = tf.Scene(
+        reading, tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2),
+        medium(tf.Schedule(PULSE), "face"),
+    )  # fmt: skip
+    recording = tf.GrowthRecording(scene, streams=range(1), seed=0)
+    model = scene.bind(seed=0)
+    replay, state = tf.Replay(model, recording), model.start()
+    for _ in range(50):
+        state = replay.step(state)
+    assert_equal(state, runs(scene, 1.25, dt=None))
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_rates_and_rules_take_its_value(backend):
+    light = tf.Schedule({0: 0.0, 0.5: 1.0, 1: 0.0}, period=1.5)
+
+    def rates(u, s, p, cell):
+        return {"dye": p.k * light(cell.time) - u.dye}
+
+    def see(cells):
+        cells.seen = light(cells.time)
+
+    scene = tf.Scene(
+        tf.Circuit(rates, species="dye", k=2.0, rtol=1e-6, backend=backend),
+        tf.Rules(see, variables={"seen": 0.0}), dim=2,
+    )  # fmt: skip
+    expected = 0.0
+    for state in tf.simulate(scene.bind(**F64), until=3.0, dt=0.05):
+        k = round(state.time / 0.05) - 1
+        on = 1.0 if k % 30 in range(10, 20) else 0.0
+        expected = 2 * on + (expected - 2 * on) * math.exp(-0.05)
+        assert float(state.dye) == pytest.approx(expected, rel=1e-6)
+        assert float(state.seen) == on
+
+
+def test_the_time_of_a_change_is_told():
+    scene = grown(medium(tf.Schedule({0: 1.0, 0.5: 0.0}, period=1.0), "source"))
+    assert "source of food changes at 0.5 h and every 1 h anew" in str(tf.explain(scene))
+
+
+def test_a_change_within_a_step_is_warned_of():
+    scene = grown(medium(tf.Schedule({0: 1.0, 0.52: 0.0}), "source"))
+    with pytest.warns(UserWarning, match=r"source of food changes at 0\.52 h, within a step"):
+        runs(scene, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: tf.Schedule([0.0, 1.0]), "a dict by time"),
+        (lambda: tf.Schedule({}), "a dict by time"),
+        (lambda: tf.Schedule({1.0: 2.0}), "given from 0 h on"),
+        (lambda: tf.Schedule({0: 1.0, "two": 2.0}), "time of Schedule.values = 'two'"),
+        (lambda: tf.Schedule({0: 1.0, -1: 2.0}), "at least 0"),
+        (lambda: tf.Schedule({0: 1.0, 2: 0.0}, period=2.0), "above 2"),
+        (lambda: tf.Dirichlet(tf.Schedule({0: 1.0, 2: -1.0})), "Dirichlet.value, from 2 h = -1"),
+        (lambda: tf.Open(tf.Schedule({0: "a"})), "Open.outside, from 0 h = 'a'"),
+        (lambda: tf.Signal(diffusion=tf.Schedule({0: 1.0})), "constant. A Schedule is for"),
+        (lambda: tf.Signal(1.0, decay=tf.Schedule({0: 1.0})), "constant. A Schedule is for"),
+        (lambda: tf.Growth(rate=tf.Schedule({0: 1.0})), "constant. A Schedule is for"),
+        (lambda: tf.Signal(1.0, flow=tf.Schedule({0: 3.0})), "from 0 h = 3.0"),
+        (
+            lambda: tf.Schedule({0: tf.Schedule({0: 1.0})}),
+            "Schedule.values, from 0 h = Schedule",
+        ),
+    ],
+)  # fmt: skip
+def test_bad_schedules(make, message):
+    with pytest.raises(tf.InputError) as error:
+        make()
+    assert message in str(error.value)
+
+
+def test_each_value_has_one_number_for_each_colony():
+    scene = grown(medium(tf.Schedule({0: 1.0, 1: tf.PerColony([1.0, 2.0, 3.0])}), "source"))
+    with pytest.raises(tf.InputError, match=r"Medium.signals\['food'\].source"):
+        scene.bind(colonies=2)

@@ -1,0 +1,96 @@
+"""A signal of a medium, as it is described: how it spreads, where it comes from, what holds at the
+faces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from torch import Tensor
+
+from torchfilm.signals.boundary_conditions import BoundaryConditions
+from torchfilm.signals.schedule import Schedule, checked_values
+from torchfilm.signals.space import checked_flow
+from torchfilm.tools import checks
+from torchfilm.values import PerColony, Rule, checked
+
+# A value on the grid: a number, one per colony, or a function from positions (M, 3) µm to (M,).
+OnGrid = float | Tensor | Callable[[Tensor], Tensor]
+# A velocity: two or three numbers (or one per colony each), or a function from positions (M, 3) µm
+# to velocities (M, 3).
+Flow = Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Signal(metaclass=checks.KnownKeywords):
+    """A substance outside the cells.
+
+    diffusion: K, µm²/h, one number or one per colony. decay: 1/h. initial: concentration at the
+    start. source: production, concentration/h. Each of these three is one number, one per colony,
+    or a function from positions (M, 3) µm to (M,). boundary, flow: faces of the box, and velocity,
+    µm/h, if they differ from the medium's. reservoir: the concentration outside an open box, one
+    number or one per colony.
+
+    source, flow and reservoir, and what the faces are given, may be a `Schedule`.
+    """
+
+    diffusion: float | Tensor
+    decay: OnGrid = 0.0
+    initial: OnGrid = 0.0
+    source: OnGrid | Schedule = 0.0
+    boundary: BoundaryConditions | None = None
+    flow: Flow | Schedule = None
+    reservoir: float | Tensor | Schedule = 0.0
+
+    instead: ClassVar[Mapping[str, str]] = {
+        "D": "Did you mean diffusion?",
+        "K": "Did you mean diffusion?",
+    }
+
+    def __post_init__(self) -> None:
+        check_boundary("Signal.boundary", self.boundary)
+        given = {
+            "diffusion": _number("Signal.diffusion", self.diffusion),
+            "decay": _on_grid("Signal.decay", self.decay),
+            "initial": _on_grid("Signal.initial", self.initial),
+            "source": checked_values("Signal.source", self.source, _on_grid),
+            "reservoir": checked_values("Signal.reservoir", self.reservoir, _number),
+            "flow": velocity("Signal.flow", self.flow),
+        }
+        for name, value in given.items():
+            object.__setattr__(self, name, value)
+
+
+def _number(name: str, given: Any) -> Any:
+    """One number, or one per colony, at least 0."""
+    made = checked(name, given, Rule(scope="colony", least=0.0))
+    return made.values if isinstance(made, PerColony) else made
+
+
+def _on_grid(name: str, given: Any) -> OnGrid:
+    # a schedule can be called, too, but not with positions
+    return given if callable(given) and not isinstance(given, Schedule) else _number(name, given)
+
+
+def velocity(name: str, given: Any) -> Any:
+    """A checked velocity, or a schedule of them."""
+    return checked_values(name, given, lambda name, flow: checked_flow(name, _bare(flow)))
+
+
+def _bare(flow: Any) -> Any:
+    """A velocity whose components for each colony are plain numbers."""
+    if not isinstance(flow, (tuple, list)):
+        return flow
+    return tuple(v.values if isinstance(v, PerColony) else v for v in flow)
+
+
+def check_boundary(name: str, given: object) -> None:
+    """Raise InputError for what are no boundary conditions."""
+    if given is not None and not isinstance(given, BoundaryConditions):
+        raise checks.input_error(
+            name,
+            given,
+            "BoundaryConditions",
+            "Write boundary=tf.BoundaryConditions(x=tf.Open(), y=tf.NoFlux()).",
+        )
