@@ -24,23 +24,26 @@ def find_or_record(
     key: everything else that the growth depends on. record: starts a new recording.
     """
     with _lock:  # threads of one search share the recordings
-        return _find(key, streams, cells) or _keep((*key, streams, cells), record())
+        found = _find(key, streams, cells) or record()
+        _keep((*key, found.streams, found.cells), found)
+        return found
 
 
 def _find(
     key: tuple[Any, ...], streams: tuple[int, ...], cells: int | None
 ) -> tf.GrowthRecording | None:
-    for known, recording in _kept.items():
+    for known, recording in list(_kept.items()):
         # a colony leaves the recording at its own end, so a longer recording serves as well
         long_enough = recording.cells is None or (cells is not None and recording.cells >= cells)
         if known[:-2] == key and set(streams) <= set(recording.streams) and long_enough:
-            _kept[known] = _kept.pop(known)  # the dictionary is in order of use, the latest last
             return recording
     return None
 
 
-def _keep(key: tuple[Any, ...], recording: tf.GrowthRecording) -> tf.GrowthRecording:
-    while _kept and sum(kept.nbytes for kept in _kept.values()) > MOST_BYTES:
+def _keep(key: tuple[Any, ...], recording: tf.GrowthRecording) -> None:
+    """Keep it as the latest in use. Recordings grow while they are used, so that each use drops
+    others above the limit."""
+    _kept.pop(key, None)
+    while _kept and sum(x.nbytes for x in (*_kept.values(), recording)) > MOST_BYTES:
         _kept.pop(next(iter(_kept)))
     _kept[key] = recording
-    return recording

@@ -268,3 +268,10 @@ def test_what_has_no_heterozygosity(given, words):
     plain = tf.Scene(tf.Growth(rate=1.0), dim=2).bind().start()
     with pytest.raises(tf.InputError, match="Give the first cells a type"):
         tf.measure.strains(plain)
+
+
+def test_forces_on_no_walls():
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2))
+    *_, state = tf.simulate(scene, until=0.1, colonies=3)
+    found = tf.measure.wall_forces(state, [], dt=0.025)
+    assert (tuple(found.force.shape), found.facing) == ((3, 0), ())

@@ -71,3 +71,25 @@ def test_what_it_may_do():
     assert faster.growth_rate.tolist() == [1.0, 1.0]
     fewer = run(lambda s: s.remove(s.colony == 0, "removed"), ("cells",))
     assert fewer.counts.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("name", ["uid", "parent", "colony_id", "stream", "next_uid"])
+def test_what_tells_cells_and_colonies_apart_stays(name):
+    changed = lambda s: s.replace(**{name: getattr(s, name) + 1})
+    with pytest.raises(tf.InputError, match=f"changed '{name}', which its writes"):
+        run(changed)
+    in_place = lambda s: (getattr(s, name).add_(3), s)[1]
+    with pytest.raises(tf.InputError, match=f"changed '{name}' in place"):
+        run(in_place)
+
+
+def test_a_field_that_is_left_out():
+    fewer = lambda s: s.replace(fields={n: x for n, x in s.fields.items() if n != "growth_rate"})
+    with pytest.raises(tf.InputError, match="left the field 'growth_rate' out"):
+        run(fewer)
+
+
+def test_it_runs_in_inference_mode():
+    with torch.inference_mode():
+        found = run(lambda s: s.with_fields(growth_rate=s.growth_rate + 1.0))
+    assert found.growth_rate.tolist() == [1.0, 1.0]

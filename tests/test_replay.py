@@ -364,3 +364,9 @@ def test_rollout_follows_a_replay_with_its_gradient(segment):
     assert bool((slopes[0] > 0).all())
     with pytest.raises(tf.InputError, match=r"dt = 0.05 .* 0.1 h, as in the recording"):
         tf.rollout(designs.replay, until=1.0, dt=0.05)
+
+
+@pytest.mark.parametrize("cells", [-1, 0, 1, 2.5, "a"])
+def test_cells_of_a_recording_are_a_whole_number(cells):
+    with pytest.raises(tf.InputError, match=r"^cells = "):
+        tf.GrowthRecording(DESIGNS["amounts shared"](1.0), streams=(0,), cells=cells)

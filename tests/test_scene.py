@@ -413,3 +413,21 @@ def test_bad_walls_and_mechanics_are_refused_at_construction(make):
 def test_one_wall_instead_of_a_list_is_reported():
     with pytest.raises(tf.InputError, match="walls"):
         tf.Mechanics(dim=2, walls=tf.Plane(y=-1.0, facing="+y"))
+
+
+def test_what_mechanics_decided_is_decided_anew_by_others():
+    flat = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2))
+    deep = flat.replace(tf.Growth(rate=1.0), tf.Mechanics(dim=3))
+    assert (deep.dim, deep.founders.dim) == (3, 3)
+    assert flat.replace(tf.Growth(rate=1.0)).dim == 2
+    with pytest.raises(tf.InputError, match="it must be 3-D, as the mechanics are"):
+        tf.Scene(
+            tf.Mechanics(dim=2), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]])
+        ).replace(tf.Mechanics(dim=3))  # fmt: skip
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.1, float("nan"), "a"])
+def test_a_step_takes_time(dt):
+    model = tf.Scene(tf.Growth(rate=1.0), dim=2).bind()
+    with pytest.raises(tf.InputError, match=r"^dt = "):
+        model.step(model.start(), dt)

@@ -184,3 +184,15 @@ def test_a_state_of_another_scene_is_refused_before_anything_runs():
         tf.simulate(tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.0)), state, until=1.0)
     with pytest.raises(tf.InputError, match="displacement"):
         tf.simulate(tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=3)), state, until=1.0)
+
+
+def test_colonies_that_stand_still_are_named_after_others_have_left():
+    """A colony that a caller takes out leaves what is known of the others as it was."""
+    hardly = tf.Scene(tf.Growth(rate=1e-9), tf.Division(length=4.0), dim=2, dt=0.01)
+    states = tf.simulate(hardly, cells=2, colonies=3)
+    with pytest.warns(RuntimeWarning, match="colony 0, 2: larger by less than a hundredth"):
+        for state in states:
+            if state.step == 150:
+                states.send(state.select([0, 2]))
+            if state.step == 1100:
+                break

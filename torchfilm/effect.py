@@ -308,9 +308,8 @@ class BoundEffect:
             v.field for v in self.values.__dict__.values() if v is not None and v.field is not None
         ]
         typed = [v for v in self.values.__dict__.values() if v is not None and v.types is not None]
-        return tuple(
-            dict.fromkeys((*self.effect.reads(), *drawn, *(("cell_type",) if typed else ())))
-        )
+        types = ("cell_type",) if typed else ()
+        return tuple(dict.fromkeys((*self.effect.reads(), *self.effect.needs(), *drawn, *types)))
 
     def writes(self) -> tuple[str, ...]:
         """Names of what a step changes."""

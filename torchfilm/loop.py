@@ -136,14 +136,16 @@ class Standstill:
 
     def __init__(self, cells: int, steps: int):
         self.cells, self.steps = cells, steps
-        self.largest: Tensor | None = None  # (B,) µm³, and at which step that was
+        self.ids: list[int] = []  # of the colonies that are looked at
+        self.largest = self.since = torch.zeros(0)  # (B,) µm³, and at which step that was
 
     @torch.no_grad()
     def __call__(self, state: State) -> Tensor:
         """(B,) bool, of those that have cells."""
         size = state.groups.sum(state.volume)
-        if self.largest is None:
-            self.largest, self.since = size, torch.full_like(state.counts, state.step)
+        ids = state.colony_id.tolist()
+        if ids != self.ids:
+            self._follow(ids, size, state.step)
         grown = size > 1.01 * self.largest
         self.largest = torch.where(grown, size, self.largest)
         self.since = torch.where(grown, state.step, self.since)
@@ -152,6 +154,16 @@ class Standstill:
             & (state.counts > 0)
             & (state.counts < self.cells)
         )
+
+    def _follow(self, ids: list[int], size: Tensor, step: int) -> None:
+        """Look at these colonies from now on, of `size` (B,) µm³; what is known of some stays."""
+        since = torch.full(size.shape, step, device=size.device)
+        size = size.clone()
+        for place, colony in enumerate(ids):
+            if colony in self.ids:
+                before = self.ids.index(colony)
+                size[place], since[place] = self.largest[before], self.since[before]
+        self.ids, self.largest, self.since = ids, size, since
 
 
 class EndlessRunWarning:

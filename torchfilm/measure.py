@@ -109,6 +109,8 @@ def wall_forces(state: State, walls: Sequence[Wall], dt: float) -> WallForces:
             " simulate with tf.Mechanics(contacts='one-sided'), the default."
         )
     surfaces = [s for wall in walls for s in wall.surfaces(state.dim)]
+    if not surfaces:
+        return WallForces(state.length.new_zeros(state.colonies, 0, dtype=torch.float64), ())
     placed = state.position, state.axis.double(), state.length.double(), state.radius.double()
     rows = find_wall_contacts(surfaces, *placed, state.own_colony_id)
     report: Any = state.reports.get("mechanics")

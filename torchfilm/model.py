@@ -94,7 +94,8 @@ class Model:
     def step(self, state: State, dt: float | None = None, timings: Timings | None = None) -> State:
         """The state dt hours later (by default the scene's step): each effect in turn."""
         after_fork()
-        dt, state = self.dt if dt is None else dt, self.opened(state)
+        dt = self.dt if dt is None else checks.number("dt", dt, above=0.0)
+        state = self.opened(state)
         # torch's threads are set once a step, not once an effect
         alone = one_torch_thread() if self._by_kernels else nullcontext()
         with alone, once(self._said) as self._said:
@@ -226,7 +227,7 @@ class Model:
             for r in self.effects
             if w.title != r.title
             for name in w.writes()
-            if name in r.reads() or name in r.effect.needs()
+            if name in r.reads()
         ]
 
     def drives(self) -> list[str]:
@@ -285,7 +286,7 @@ class Model:
         writes: dict[int, set[str]] = {e.place: set() for e in self.effects}
         declares: dict[int, list[Field]] = {e.place: [] for e in self.effects}
         for e in self.effects:
-            reads[e.place] |= {*e.reads(), *e.effect.needs()}
+            reads[e.place] |= set(e.reads())
             writes[e.place] |= set(e.writes())
             declares[e.place] += e.declares()
         return reads, writes, declares

@@ -6,17 +6,22 @@ from collections.abc import Collection, Mapping
 
 from torch import Tensor
 
-from torchfilm.state import State
+from torchfilm.state import PER_CELL, PER_COLONY, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import unchanged
 
-GEOMETRY = ("position", "axis", "length", "radius")
+COLUMNS = (*PER_CELL, *PER_COLONY)
 
 
 def seen(state: State) -> dict[str, tuple[Tensor, int]]:
     """What an effect may change, by name, each with how often it was changed in place."""
-    parts = {n: getattr(state, n) for n in GEOMETRY} | dict(state.fields)
-    return {n: (x, x._version) for n, x in parts.items()}
+    parts = {n: getattr(state, n) for n in COLUMNS} | dict(state.fields)
+    return {n: (x, _version(x)) for n, x in parts.items()}
+
+
+def _version(x: Tensor) -> int:
+    """How often a tensor was changed in place, where torch counts it."""
+    return 0 if x.is_inference() else x._version
 
 
 def check_step(
@@ -28,12 +33,17 @@ def check_step(
     if not isinstance(after, State):
         raise TypeError(f"{name}.step must return the state; it returned {_shown(after)}")
     for what, (old, version) in before.items():
-        if old._version != version:
+        if _version(old) != version:
             raise checks.InputError(
                 f"{name}.step changed {what!r} in place: earlier states share this tensor. Write"
                 f" state.with_fields({what}=…) or state.replace({what}=…) with a new one."
             )
-        new = getattr(after, what) if what in GEOMETRY else after.fields[what]
+        if what not in COLUMNS and what not in after.fields:
+            raise checks.InputError(
+                f"{name}.step left the field {what!r} out: keep the state's fields, by"
+                " state.with_fields(…)."
+            )
+        new = getattr(after, what) if what in COLUMNS else after.fields[what]
         if new is old:
             continue
         if new.dtype != old.dtype:

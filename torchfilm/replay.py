@@ -94,6 +94,8 @@ class GrowthRecording(metaclass=checks.KnownKeywords):
         self.grown_by = _listing(design)
         self.dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
         design.check_step(self.dt)
+        if cells is not None:
+            cells = checks.integer("cells", cells, least=2)
         self.streams, self.cells = tuple(streams), cells
         if len(set(self.streams)) != len(self.streams):
             raise checks.input_error("streams", self.streams, "different integers")

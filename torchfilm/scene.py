@@ -50,6 +50,7 @@ class Scene(metaclass=checks.KnownKeywords):
     accuracy: dict[str, float]
     code: list[str]
     declared_by: dict[str, str]
+    _given: dict[str, Any]  # founders and dim, None where other things decided
     _said: frozenset[str]  # warnings given when it was made
 
     instead: ClassVar[Mapping[str, str]] = NO_KEYWORD
@@ -72,6 +73,7 @@ class Scene(metaclass=checks.KnownKeywords):
             "recipe": recipe,
             "settings": dict(settings or {}),
             "accuracy": dict(accuracy or {}),
+            "_given": {"founders": founders, "dim": dim},
             "dt": checks.number("Scene.dt", dt, above=0.0),
         }
         made["dim"] = _dimension(effects, founders, dim)
@@ -119,7 +121,9 @@ class Scene(metaclass=checks.KnownKeywords):
             if name not in CHANGEABLE:
                 known = ("*effects", *CHANGEABLE)
                 raise checks.unknown_keyword("Scene.replace", name, known, NO_KEYWORD)
-        kept = {name: getattr(self, name) for name in CHANGEABLE}
+        kept: dict[str, Any] = {name: getattr(self, name) for name in CHANGEABLE}
+        if any(hasattr(e, "dim") for e in effects):  # they decide what was not given
+            kept |= self._given
         with once(self._said):  # what this scene has warned of, its copies need not
             return Scene(*(effects or self.effects), **{**kept, **changes})
 

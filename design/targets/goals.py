@@ -44,7 +44,9 @@ class Burden(Target):
     def _of(self, state: tf.State) -> tuple[str, ...]:
         if self.species is not None:
             return self.species
-        return tuple(n for n, f in state.declared.items() if f.unit == CONCENTRATION)
+        return tuple(
+            n for n, f in state.declared.items() if (f.unit, f.scope) == (CONCENTRATION, "cell")
+        )
 
     def check(self, state: tf.State) -> None:
         require(state, self._of(state))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -117,6 +118,25 @@ class Lasting(Target):
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         worst = self._losses(state, history).nan_to_num(-torch.inf).amax(0)
         return {**self.target.measures(state), "worst": worst.detach()}
+
+    @property
+    def pattern(self) -> bool:  # type: ignore[override]
+        return self.target.pattern
+
+    @property
+    def anywhere(self) -> bool:  # type: ignore[override]
+        return self.target.anywhere
+
+    @property
+    def bounds(self) -> dict[str, str]:
+        return self.target.bounds
+
+    @property
+    def evidence(self) -> dict[str, tuple[float, float]]:
+        return self.target.evidence
+
+    def remark(self, loss: np.ndarray) -> str:
+        return self.target.remark(loss)
 
     @property
     def mark(self) -> str:

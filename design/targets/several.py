@@ -34,6 +34,14 @@ class Several(Target):
         return sum(part.failed for part in self.parts)
 
     @property
+    def pattern(self) -> bool:  # type: ignore[override]
+        return any(part.pattern and part.names for part in self.parts)
+
+    @property
+    def anywhere(self) -> bool:  # type: ignore[override]
+        return all(part.anywhere for part in self.parts if part.names)
+
+    @property
     def times(self) -> tuple[float, ...]:
         return tuple(sorted({time for part in self.parts for time in part.times}))
 

@@ -10,7 +10,20 @@ import torch
 from patterned import SHARP, crowded, graded, placed
 
 import torchfilm as tf
-from design import Bands, Gradient, Lasting, Oscillation, Parameter, Ring, Search
+from design import (
+    Bands,
+    Burden,
+    Constrained,
+    Gradient,
+    Lasting,
+    Observed,
+    OnFraction,
+    Oscillation,
+    Parameter,
+    Ring,
+    Search,
+    Weighted,
+)
 from design.targets.outline import Ellipses, below_edge, ellipses
 
 
@@ -183,3 +196,28 @@ def test_the_middle_of_a_circle_lies_a_radius_below_its_edge():
     places = torch.tensor([[0.0, 0.0], [0.0, 3.0], [6.0, 0.0]]).double()
     found = circle.below_edge(places, torch.zeros(3, dtype=torch.int64))
     assert found.tolist() == pytest.approx([5.0, 2.0, -1.0])
+
+
+def test_what_a_target_says_of_itself_holds_from_a_time_on():
+    """Constraints are named, data are not compared with answers without a pattern, and every second
+    cell lit is no rival of a share of cells that may lie anywhere."""
+    kept = Constrained(Burden(), [Ring("yfp", radius=10.0, width=5.0)], at_least={"burden": 2.0})
+    seen = Observed.from_table({"length_um": [2.0, 3.0, 2.5], "colony": [0, 0, 1]})
+    share = OnFraction("yfp", level=1.0, fraction=0.5)
+    for target in (kept, seen, share):
+        found = Lasting(target, since=0.5)
+        for name in ("pattern", "anywhere", "bounds", "evidence"):
+            assert getattr(found, name) == getattr(target, name), (target, name)
+    assert (kept.pattern, seen.pattern, share.anywhere) == (True, False, True)
+    assert Lasting(kept, since=0.5).bounds == {"burden": "≥ 2"}
+    several = Weighted([(seen, 1.0), (Burden(), 0.5)])
+    assert not several.pattern
+
+
+def test_burden_counts_species_and_no_signals():
+    making = tf.Circuit(lambda u, s, p, cell: {"a": 0 * u.a + 0 * s.ahl}, species="a",
+                        initial={"a": 1.0})  # fmt: skip
+    ahl = tf.Signal(diffusion=1.0, initial=100.0)
+    medium = tf.Medium(ahl=ahl, box=((-8, -8), (8, 8)), spacing=4.0)
+    state = tf.Scene(making, medium, tf.Mechanics(dim=2)).bind().start()
+    assert float(Burden().loss(state)) == pytest.approx(1.0)

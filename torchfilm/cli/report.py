@@ -78,7 +78,7 @@ def extra_columns_note(path: str, cells: Cells, model: Model) -> str:
     """Which columns of the table become fields that no effect of the scene uses; empty if there is
     none."""
     used = {f.name for e in model.effects for f in e.declares()}
-    used |= {name for e in model.effects for name in (*e.reads(), *e.effect.needs())}
+    used |= {name for e in model.effects for name in e.reads()}
     extra = [name for name in cells.extra if name not in used]
     if not extra:
         return ""

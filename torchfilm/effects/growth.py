@@ -116,10 +116,8 @@ class Growth(Effect):
                 " their own, which their descendants keep. Write Growth(), or leave theirs out"
                 " (Cells.from_table takes the further columns that fields=[…] names)."
             )
-        others = [e for e in effects if e is not self and not is_own(e)]
-        sets = any(e.writes_anything or "growth_rate" in e.writes() for e in others) or len(
-            others
-        ) + 1 < len(effects)
+        others = [e for e in effects if e is not self]
+        sets = any(is_own(e) or e.writes_anything or "growth_rate" in e.writes() for e in others)
         if self.rate is None and not sets and "growth_rate" not in founders.extra:
             warn(
                 "Growth() has no rate, and no rule or nutrition sets growth_rate: nothing grows."

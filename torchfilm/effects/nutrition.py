@@ -162,7 +162,9 @@ class BoundMonod(BoundEffect):
         return (name,) if name in self.binding.declared else ()
 
     def reads(self) -> tuple[str, ...]:
-        return (*super().reads(), f"{self.effect.signal}_eaten", *self._reservoir())
+        # growth_rate must be there, but Monod sets it whatever it was
+        read = [n for n in super().reads() if n != "growth_rate"]
+        return (*read, f"{self.effect.signal}_eaten", *self._reservoir())
 
     def writes(self) -> tuple[str, ...]:
         return (*super().writes(), *self._reservoir())
