@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gzip
+import math
 import re
 import sys
+import warnings
 
 import pytest
 from modelled import QUORUM, REPRESSILATOR, TOGGLE, apply, law, read, sbml
@@ -285,3 +288,81 @@ def test_the_advice_for_a_renamed_variable_can_be_followed():
         tf.Circuit.from_antimony(text, time_unit="h", x=2.0)
     circuit = tf.Circuit.from_antimony(text, time_unit="h", initial={"x_": 2.0})
     assert circuit.initial["x_"] == 2.0
+
+
+@pytest.mark.parametrize(
+    ("text", "given", "words"),
+    [
+        ("species Ä; Ä = 1; Ä -> ; Ä", {}, "letters a to z"),
+        ("species a; a = 1; a -> ; a", {"dilution": 0.3}, r"dilution = 0.3 .* option of to_sbml"),
+        ("compartment c = 0; species a in c; a = 1; a -> ; a", {}, "'c' has a size of 0"),
+        (
+            "compartment c = 2; substanceOnly species a in c; a = 1; a -> ; a",
+            {"properties": {"c": "volume"}},
+            "'a' is an amount .* make it a concentration",
+        ),
+        ("species a; a = 1; a -> ; a; late: at (time > 1): a = 2;", {}, "piecewise rate"),
+    ],
+)
+def test_what_no_circuit_can_be_says_what_to_do(text, given, words):
+    with pytest.raises(tf.InputError, match=words):
+        tf.Circuit.from_antimony(text, **given)
+
+
+@pytest.mark.parametrize("number", ["NaN", "-1", "INF"])
+def test_stoichiometries_are_numbers(number):
+    reaction = (
+        '<listOfReactions><reaction id="J" reversible="false"><listOfReactants>'
+        f'<speciesReference species="A" stoichiometry="{number}" constant="true"/>'
+        "</listOfReactants><kineticLaw><math><ci>A</ci></math></kineticLaw></reaction>"
+        "</listOfReactions>"
+    )
+    with pytest.raises(tf.InputError, match="the stoichiometry of 'A' is"):
+        read(sbml(HEAD + reaction))
+
+
+def test_a_file_that_is_packed_is_to_be_unpacked(tmp_path):
+    path = tmp_path / "model.xml.gz"
+    path.write_bytes(gzip.compress(b"<sbml/>"))
+    with pytest.raises(tf.InputError, match="unpack it"):
+        tf.Circuit.from_sbml(path)
+
+
+def test_constants_that_are_computed_from_numbers_are_constants():
+    text = "species a; a = 1; a -> ; k*a; k = ln(2)/10;"
+    circuit = tf.Circuit.from_antimony(text)
+    assert circuit.parameters == {"k": pytest.approx(math.log(2) / 10)}
+    assert tf.Circuit.from_antimony(text, k=[0.1, 0.2]).parameters["k"].tolist() == [0.1, 0.2]
+
+
+def test_a_species_does_not_take_the_name_of_what_mechanics_read():
+    assert tf.Circuit.from_antimony("species drag; drag = 1; -> drag; 5").species == ("drag_",)
+    with pytest.raises(tf.InputError, match="'drag' as how much a cell resists motion"):
+        tf.Circuit(lambda u, s, p, cell: {"drag": 1.0 - u.drag}, species="drag")
+
+
+def test_a_long_sum_is_read():
+    terms = " + ".join(f"{k}*a" for k in range(1, 1001))
+    circuit = tf.Circuit.from_antimony(f"species a; a = 1; a -> ; {terms}")
+    assert float(circuit.graph.evaluate({"a": 2.0})["a"]) == pytest.approx(-2.0 * 500500)
+
+
+def test_concentrations_that_are_too_small_for_atol_are_warned_of():
+    text = "species a, b; a = 1e-9; b = 0; a -> b; k*a; b -> ; 3*b; k = 20"
+    with pytest.warns(UserWarning, match=r"its species are of about 2e-08, .*Give atol=2e-14"):
+        tf.Scene(tf.Circuit.from_antimony(text), dim=2).bind()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tf.Scene(tf.Circuit.from_antimony(text, atol=2e-14), dim=2).bind()
+
+
+def test_a_model_too_large_for_kernels_runs_by_torch():
+    """Every species meets every other: elimination fills the matrix."""
+    names = [f"s{k}" for k in range(34)]
+    text = f"species {', '.join(names)};" + "".join(
+        f" {n} = 1; {n} -> ; {n}*({' + '.join(names)});" for n in names
+    )
+    scene = tf.Scene(tf.Circuit.from_antimony(text), dim=2, dt=0.01)
+    *_, state = tf.simulate(scene, until=0.01)
+    assert float(state.s0[0]) == pytest.approx(1 / (1 + 34 * 0.01), rel=1e-2)
+    assert "entries after elimination, more than the 999" in str(tf.explain(scene))

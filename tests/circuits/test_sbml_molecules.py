@@ -67,6 +67,45 @@ def test_a_law_that_is_a_difference_goes_both_ways():
     assert float(a.var()) == pytest.approx(number * share * (1 - share), rel=0.3)
 
 
+ONE_WAY = r"the law of the reaction 'turn' can be below 0, where nothing happens"
+
+
+def test_what_is_left_of_a_total_goes_one_way():
+    """A form that the model does not count is the rest of a total: as two reactions, one would take
+    what is not there, and the other make noise. Binomial again."""
+    text = """
+      species a, b;
+      lose: a -> b; f*a
+      turn: b -> a; r*(total - a)
+      f = 1; r = 1; a = 10; b = 0; total = 10;
+    """
+    with pytest.warns(UserWarning, match=ONE_WAY):
+        assert sides(text) == {"lose": ({"a": 1}, {"b": 1}), "turn": ({"b": 1}, {"a": 1})}
+    with pytest.warns(UserWarning, match=ONE_WAY):
+        counts, volume = grown(text, 4.0, method="direct")
+    number, a = round(10 * volume), counts["a"]
+    assert abs(float(a.mean()) - number / 2) < 4 * math.sqrt(number / 4 / len(a)) + 0.5
+    assert float(a.var()) == pytest.approx(number / 4, rel=0.3)
+
+
+def test_pairs_of_few_molecules():
+    """Two molecules meet n(n − 1) ways, n/V of which a law writes as a less a single molecule's
+    concentration; the mean time until one of 2 is left is as in the chain of states."""
+    text = "species a, b; turn: 2 a -> b; k*a*(a - one); k = 1; a = 0; b = 0; one = 1;"
+    volume = float(tf.Scene(tf.Growth(rate=1.0), founders=CELL, dim=2).bind().start().volume[0])
+    with pytest.warns(UserWarning, match=ONE_WAY):
+        counts, _ = grown(text, 0.4, method="direct", one=1 / volume, initial={"a": 4 / volume})
+    fast, slow = 12 / volume, 2 / volume  # k n(n − 1)/V from 4 and from 2 molecules
+    left = {  # the probabilities of 4, 2 and 0 after 0.4 h
+        4: math.exp(-0.4 * fast),
+        2: fast / (fast - slow) * (math.exp(-0.4 * slow) - math.exp(-0.4 * fast)),
+    }
+    found = counts["a"].round()
+    for number, chance in left.items():
+        error = math.sqrt(chance * (1 - chance) / len(found))
+        assert abs(float((found == number).double().mean()) - chance) < 4 * error
+
+
 @pytest.mark.parametrize(
     ("text", "ways"),
     [

@@ -27,6 +27,9 @@ from torchfilm.circuits.expressions import (
 )
 from torchfilm.circuits.tracing import CASTS, FULL, Kind, Untraceable, common_type, kind_of
 
+# Numba's limit of tuples.
+MOST_ENTRIES = 999
+
 SIGNS = {
     "add": "+", "sub": "-", "mul": "*", "div": "/", "gt": ">", "ge": ">=", "lt": "<", "le": "<=",
     "eq": "==", "ne": "!=", "and": "&", "or": "|",
@@ -289,7 +292,12 @@ def tangent_functions(equations: Equations, moving: Sequence[str]) -> str:
 
 def _linear(pattern: Pattern) -> str:
     """The matrix 2/h − J: products with J, elimination without pivoting, and substitution, in the
-    order of `circuits.linear`."""
+    order of `circuits.linear`. Raises Untraceable where it has too many entries."""
+    if len(pattern.filled) > MOST_ENTRIES:
+        raise Untraceable(
+            f"its matrix has {len(pattern.filled)} entries after elimination, more than the"
+            f" {MOST_ENTRIES} that a kernel takes; method='rk4' needs no matrix"
+        )
     size, at = pattern.size, {k: n for n, k in enumerate(pattern.slopes)}
     x = [f"b{i}" for i in range(size)]
     slopes = [f"j{i}_{k}" for i, k in pattern.slopes]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -12,13 +12,19 @@ from torchfilm.circuits.network import Network
 from torchfilm.circuits.run import CircuitCells
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
+from torchfilm.tools.warn_once import warn
+
+# Species are too small for `atol` where it is more than this part of them.
+SMALL = 1e-3
+ATOL = 1e-9  # the default; a larger one has been chosen
 
 
 def try_circuit(
-    circuit: CircuitCells, concentrations: Tensor, unlike: CircuitCells, derivatives: bool = False
-) -> tuple[str, ...]:
+    circuit: CircuitCells, concentrations: Tensor, unlike: CircuitCells,
+    atol: float | None = None,
+) -> tuple[str, ...]:  # fmt: skip
     """Calls the circuit once at concentrations (M, S), with derivatives if its method needs them.
-    unlike: as many cells that differ from one another.
+    unlike: as many cells that differ from one another. atol: of a method that takes derivatives.
 
     Returns the names of the signals that it exchanges. Raises InputError for wrong return values.
     """
@@ -32,7 +38,7 @@ def try_circuit(
         ).unsqueeze(1)
         crowd = unlike.changes(some, unlike.rows)
         alone = [unlike.changes(some[k : k + 1], unlike.rows[k : k + 1]) for k in (0, count - 1)]
-        if derivatives:
+        if atol is not None:
             with torch.enable_grad():
                 circuit.changes(some.detach().clone().requires_grad_(), circuit.rows)
     except UnknownName as error:
@@ -61,6 +67,8 @@ def try_circuit(
                     f"{circuit.label} gives {float(value[k])} for the {what} {name!r} at the start"
                     f" ({at}): every rate must be a finite number."
                 )
+    if atol is not None:
+        _check_size(circuit.label, [concentrations, *inside.values()], atol)
     if isinstance(circuit.part, Network):
         exchanged = {
             n.removeprefix("out.")
@@ -85,3 +93,15 @@ def _check_alone(
                 " (a sum or a mean over them, or a draw?). A rate function may use only its own"
                 " cell and the concentrations outside it."
             )
+
+
+def _check_size(label: str, numbers: Sequence[Tensor], atol: float) -> None:
+    """Warn where species are so small, at first and by what an hour makes, that their errors count
+    as nothing."""
+    size = max(float(x.detach().abs().max()) for x in numbers if x.numel())
+    if 0 < SMALL * size < atol <= ATOL:
+        warn(
+            f"{label}: its species are of about {size:.0e}, and errors below Circuit.atol ="
+            f" {atol:.0e} count as none. Give atol={1e-3 * SMALL * size:.0e}, or concentrations in"
+            " a smaller unit, such as nM in place of M."
+        )

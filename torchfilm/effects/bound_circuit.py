@@ -136,7 +136,7 @@ class BoundCircuit(BoundEffect):
                 tried,
                 torch.stack(each, 1),
                 self._unlike(state, rows, kind, found),
-                derivatives=circuit.method == "rosenbrock",
+                circuit.atol if circuit.method == "rosenbrock" else None,
             )
         check_read(circuit, seen["p"])
         if circuit.is_stochastic and self.values.requires_grad:

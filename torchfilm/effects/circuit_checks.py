@@ -20,6 +20,8 @@ STIFF, LEAP, DIRECT = "rosenbrock", "tau_leap", "direct"
 EXPLICIT = ("euler", *integrators.METHODS)
 METHODS = (STIFF, *EXPLICIT, LEAP, DIRECT)
 GEOMETRY = ("volume", "area", "x", "y", "z")
+# Fields that effects read where there are any, by what they are for.
+READ_BY_OTHERS = {"drag": "mechanics takes 'drag' as how much a cell resists motion"}
 
 
 def equations_of(circuit: Any) -> dict[str, str]:
@@ -50,7 +52,7 @@ def _fit(names: Sequence[Any]) -> bool:
 
 
 def check_species(names: tuple[str, ...], shared: Mapping[str, str]) -> None:
-    taken = [n for n in (*names, *shared) if n in RESERVED or n in GEOMETRY]
+    taken = [n for n in (*names, *shared) if n in (*RESERVED, *GEOMETRY, *READ_BY_OTHERS)]
     if taken:
         raise checks.input_error(
             "Circuit.species",
@@ -65,6 +67,8 @@ def check_species(names: tuple[str, ...], shared: Mapping[str, str]) -> None:
 
 def _meaning(name: str) -> str:
     """What a name that is in use stands for, in words."""
+    if name in READ_BY_OTHERS:
+        return READ_BY_OTHERS[name]
     if name in ("x", "y", "z"):
         return f"{name!r} is the place of a cell"
     of_cells = name in (*PER_CELL, *GEOMETRY)

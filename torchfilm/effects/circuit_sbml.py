@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchfilm.circuits import sbml
 from torchfilm.circuits.names import label_of, unknown
-from torchfilm.effects.circuit_checks import DIRECT, GEOMETRY, LEAP
+from torchfilm.effects.circuit_checks import DIRECT, GEOMETRY, LEAP, READ_BY_OTHERS
 from torchfilm.parameters import shorten
 from torchfilm.state import RESERVED
 from torchfilm.tools import checks
@@ -57,6 +57,11 @@ def keywords(
     text: str, where: str, choices: sbml.Given, dilution: bool | Sequence[str], options: Mapping
 ) -> dict[str, Any]:
     """A circuit's keywords for a model in SBML. options: those of a circuit, among others."""
+    if not isinstance(dilution, (bool, str)) and not (
+        isinstance(dilution, (list, tuple)) and all(isinstance(n, str) for n in dilution)
+    ):
+        hint = "A rate of dilution is an option of to_sbml alone; here growth sets it."
+        raise checks.input_error("dilution", dilution, "True, False, or names of species", hint)
     found = sbml.describe(text, where, choices)
     return {
         "rates": found.rates,
@@ -95,7 +100,7 @@ def model_choices(
         initial=initial or {},
         molecules=keywords.get("method") in (DIRECT, LEAP),
         options=options,
-        fields=(*RESERVED, *GEOMETRY),
+        fields=(*RESERVED, *GEOMETRY, *READ_BY_OTHERS),
     )
 
 

@@ -66,6 +66,10 @@ def to_sbml(text: str, where: str) -> str:
         if left:
             warn(f"{where} has several models: {main} is read, and not {', '.join(left)}.")
         return str(antimony.getSBMLString(main))
+    except UnicodeDecodeError as error:  # of a message that quotes half a letter
+        raise InputError(
+            f"{where}: ids are of the letters a to z, digits and _; others may stand in comments."
+        ) from error
     finally:
         antimony.clearPreviousLoads()
         antimony.freeAll()

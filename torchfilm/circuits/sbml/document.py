@@ -17,6 +17,7 @@ MAX_DEPTH = 250
 OWN_PACKAGES = ("l3v2extendedmath",)  # functions of Level 3 Version 2, which libsbml calls one
 DRAWINGS = ("layout", "render")  # packages that change no number
 UNNAMED_EVENT = r"_E\d+"  # what Antimony calls an event without a name
+PACKED = (b"\x1f\x8b", b"PK", b"BZh")  # how files begin that are compressed
 ENCODINGS = ("utf-8", "ascii", "us-ascii")  # SBML is UTF-8, of which ASCII is a part
 # Errors of libsbml in names of units, which convert nothing; those of time are read by `units`.
 UNITS = (10313, *range(20217, 20222))
@@ -50,8 +51,9 @@ def decoded(content: bytes, where: str) -> str:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
+        todo = "unpack it" if content.startswith(PACKED) else "save it in that encoding"
         raise InputError(
-            f"{where} is not UTF-8 (line {line}, byte {error.start}): save it in that encoding."
+            f"{where} is not UTF-8 (line {line}, byte {error.start}): {todo}."
         ) from error
     if not text.strip():
         raise InputError(f"{where} is empty.")
@@ -187,7 +189,10 @@ def _unsupported(document: Any, model: Any) -> Iterator[str]:
             yield f"it needs the package {prefix}, which torchfilm does not read"
     for event in model.getListOfEvents():
         late = " with a delay" if event.isSetDelay() else ""
-        yield f"{_event(event)}{late} is not supported: torchfilm has no events"
+        yield (
+            f"{_event(event)}{late} is not supported: torchfilm has no events. What happens at a"
+            " time can be a piecewise rate of the time, and what cells do once in a step, tf.Rules"
+        )
     for k, rule in enumerate(model.getListOfRules()):
         if rule.isAlgebraic():
             yield (

@@ -131,6 +131,10 @@ def calculate(b: Builder, op: str, *given: Term) -> Term:
     return operate(b, op, *(numeric(b, x) for x in given))
 
 
+# So many operands in one chain: expressions are walked by recursion.
+LONG = 200
+
+
 def _folded(op: str, empty: float | None = None) -> Callable[..., Term]:
     """An operation on any number of operands, from the left."""
 
@@ -138,6 +142,9 @@ def _folded(op: str, empty: float | None = None) -> Callable[..., Term]:
         if not given and empty is not None:
             return empty
         numbers: Sequence[Term] = [numeric(b, x) for x in given]
+        while len(numbers) > LONG:  # in parts, or expressions would be nested too deeply
+            parts = [numbers[k : k + LONG] for k in range(0, len(numbers), LONG)]
+            numbers = [functools.reduce(lambda x, y: calculate(b, op, x, y), p) for p in parts]
         return functools.reduce(lambda x, y: calculate(b, op, x, y), numbers)
 
     return rule

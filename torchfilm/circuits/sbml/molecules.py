@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ from torchfilm.circuits.sbml.algebra import over
 from torchfilm.circuits.sbml.mathml import calculate
 from torchfilm.circuits.sbml.quantities import Quantities
 from torchfilm.tools.checks import InputError
+from torchfilm.tools.warn_once import warn
 
 BACKWARDS = " backwards"
 TRIALS = 4096  # states at which the sign of a law is tried
@@ -94,7 +95,7 @@ def _of(
             f"the reaction {name!r} depends on the time, which single molecules do not know: choose"
             " a method that solves rates"
         )
-    forwards, backwards = _both_ways(quantities, name, law)
+    forwards, backwards = _both_ways(quantities, name, law, taken, made)
     for rate, sides, title in ((forwards, (taken, made), name),
                                (backwards, (made, taken), name + BACKWARDS)):  # fmt: skip
         if _none(rate):
@@ -143,8 +144,14 @@ def _size(quantities: Quantities, reaction: str, cell: Callable[[], Term]) -> Te
     return next(iter(sizes)) if sizes else cell()
 
 
-def _both_ways(quantities: Quantities, reaction: str, law: Term) -> tuple[Term, Term]:
-    """The rate forwards and the rate back, 0 where the law is never below 0, as 1 − x/(K + x)."""
+def _both_ways(
+    quantities: Quantities, reaction: str, law: Term, taken: Collection[str], made: Collection[str]
+) -> tuple[Term, Term]:
+    """The rate forwards and the rate back, 0 where the law is never below 0, as 1 − x/(K + x).
+
+    Each way must need what it takes. Else the law goes one way, 0 where it is below 0, as
+    k·(total − a), where a conserved sum keeps it above.
+    """
     if not isinstance(law, Expression) or not _can_be_negative(quantities, law):
         return law, 0.0
     plus, minus = _parts(quantities, law)
@@ -155,25 +162,47 @@ def _both_ways(quantities: Quantities, reaction: str, law: Term) -> tuple[Term, 
             f"the law of the reaction {reaction!r} can be below 0, and is no difference of two that"
             " cannot: write it as two reactions, forwards and back"
         )
-    return plus, minus
+    if _needs(quantities, plus, taken) and _needs(quantities, minus, made):
+        return plus, minus
+    warn(
+        f"the law of the reaction {reaction!r} can be below 0, where nothing happens: it is no"
+        " difference of a rate that needs what the reaction takes and one that needs what it makes"
+    )
+    return calculate(quantities.builder, "maximum", law, 0.0), 0.0
+
+
+def _needs(quantities: Quantities, rate: Term, names: Collection[str]) -> bool:
+    """Whether a rate is 0 where any of these species, or "out." and signals, is."""
+    if not isinstance(rate, Expression):
+        return not names
+    leaves = {n: f"s.{n.removeprefix(OUTSIDE)}" if n.startswith(OUTSIDE) else f"u.{n}"
+              for n in names}  # fmt: skip
+    return all(bool((_tried(quantities, rate, absent=x) == 0).all()) for x in leaves.values())
 
 
 def _can_be_negative(quantities: Quantities, law: Expression) -> bool:
     """Whether a law is below 0 somewhere, tried at random positive species and signals, over eight
     orders of magnitude about 1 and about the constants, which have the model's values."""
+    values = _tried(quantities, law)
+    scale = values.abs()[values.isfinite()].max() if bool(values.isfinite().any()) else 0.0
+    return bool((values < -1e-12 * scale).any())
+
+
+def _tried(quantities: Quantities, law: Expression, absent: str = "") -> Tensor:
+    """A law at the states of `_can_be_negative`, (TRIALS,), with a leaf that is 0 in all."""
     constants = {f"p.{quantities.column(n)}": x for n, x in quantities.constants.items()}
     random = np.random.default_rng(0)
     about = [1.0, *(abs(x) for x in constants.values() if x)]
 
     def leaf(node: Expression) -> Tensor:
+        if node.name == absent:
+            return torch.zeros(TRIALS, dtype=torch.float64)
         if constants.get(node.name):  # one that was given for each colony, or is drawn, is 0 there
             return torch.full((TRIALS,), float(constants[node.name]), dtype=torch.float64)
         drawn = random.choice(about, TRIALS) * 10.0 ** random.uniform(-4.0, 4.0, TRIALS)
         return torch.from_numpy(drawn)
 
-    (values,) = evaluated([law], leaf)
-    scale = values.abs()[values.isfinite()].max() if bool(values.isfinite().any()) else 0.0
-    return bool((values < -1e-12 * scale).any())
+    return evaluated([law], leaf)[0]
 
 
 def _parts(quantities: Quantities, x: Term) -> tuple[Term, Term]:

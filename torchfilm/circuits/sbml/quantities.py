@@ -165,7 +165,9 @@ class Quantities:
             return b.name(f"u.{self.column(name)}")
         if name in self.initial and name not in self.choices.values and kind != SPECIES:
             try:  # a constant that depends on other constants follows them
-                return self.formulas.of(self.initial[name], _Constants(self))
+                follows = self.formulas.of(self.initial[name], _Constants(self))
+                if isinstance(follows, Expression):  # and not a number, such as ln(2)/10
+                    return follows
             except NotConstant:
                 pass
         if name == IMPLIED and name not in self.choices.values and self.first(name) == 1:
@@ -207,7 +209,13 @@ class Quantities:
             raise InputError(
                 f"the stoichiometry of {reference.getSpecies()!r} is not given: give a number"
             )
-        return float(reference.getStoichiometry()) / (reference.getDenominator() or 1)
+        found = float(reference.getStoichiometry()) / (reference.getDenominator() or 1)
+        if not 0 <= found < float("inf"):
+            raise InputError(
+                f"the stoichiometry of {reference.getSpecies()!r} is {found:g}: it must be a number"
+                " of at least 0"
+            )
+        return found
 
     def law(self, name: str) -> float | Expression:
         """The rate of a reaction, in amounts per unit of the model's time."""
@@ -337,6 +345,8 @@ class Quantities:
             is_set = True  # 1 is the default there
         if not is_set:
             raise InputError(f"the {kind} {name_of(thing)} has no value: give {name}=…")
+        if kind == COMPARTMENT and found == 0:
+            raise InputError(f"the compartment {name!r} has a size of 0: give {name}=…")
         return float(found)
 
     def _first_of_species(self, name: str, species: Any) -> float:

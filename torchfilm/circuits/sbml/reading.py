@@ -142,7 +142,10 @@ def _describe(
         raise InputError("nothing in the model changes: it has no reaction and no rate rule")
     _check_given(quantities, given)
     things = quantities.things
-    diluted = [new for old, new in names.items() if old in things and things[old][0] == SPECIES]
+    diluted = {new: old for old, new in names.items()
+               if old in things and things[old][0] == SPECIES}  # fmt: skip
+    for old in diluted.values() if not marks else ():
+        _check_amount(quantities, old)
     return Description(
         rates,
         tuple(names.values()),
@@ -318,6 +321,18 @@ def _reference(quantities: Quantities, variables: Sequence[str]) -> Term:
             ' the cell, such as properties={"cytosol": "volume"}'
         )
     return quantities.value(homes[0])
+
+
+def _check_amount(quantities: Quantities, name: str) -> None:
+    """Refuse an amount in a compartment that is a property of the cell: growth dilutes the numbers
+    of species, which would have to be concentrations."""
+    species = quantities.things[name][1]
+    home = species.getCompartment()
+    if species.getHasOnlySubstanceUnits() and home in quantities.choices.cell:
+        raise InputError(
+            f"{name!r} is an amount (substanceOnly), and its compartment {home!r} a property of the"
+            " cell: make it a concentration, or leave the property out"
+        )
 
 
 def _first(quantities: Quantities, name: str, initial: Mapping[str, Any]) -> Any:
