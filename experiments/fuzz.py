@@ -9,7 +9,7 @@ signals on grids of odd shapes with boundary conditions, flow and obstacles, and
 than a second to hours. With --contacts it draws cells, one-sided contacts, walls and growth alone.
 The last step of one-sided contacts is computed by the compiled kernels and by the torch reference.
 Hypothesis reduces the first example that breaks a law and prints it as a `Draw`, which `run`
-accepts. docs/stability.md lists the findings. tests/test_fuzz.py runs a hundred examples.
+accepts. fuzz_log.md lists the findings. tests/test_fuzz.py runs a hundred examples.
 """
 
 from __future__ import annotations

@@ -126,7 +126,7 @@ def _descents(cloud: CMAES, about: str) -> tuple[Chosen, ...]:
     return tuple(
         Chosen(
             Polish(inner=Racing(inner=cloud), after=BEFORE, starts=starts),
-            f"{about}: one race of small colonies, then down the slope from the best, of one"
+            f"{about}: one race of small colonies, then by gradients from the best, of one"
             " replicate at first, since the loss is a sum of squares with exact derivatives",
         )
         for starts in range(1, MOST_STARTS + 1)

@@ -30,14 +30,14 @@ class CMAES(AskTell):
     arXiv:1604.00772), by the package cma.
 
     population: points in a batch. None is 4 + 3 ln D, rounded down, or, where there are levels, 6 +
-    3 ln(D · dimensions with levels). sigma: width of the first cloud of points, as a share of each
-    range. noisy: learn slowly, for losses with noise. A search grows every design on the same
-    seeds, so its losses have none; those of a user's own function may. restarts: when a cloud has
+    3 ln(D · dimensions with levels). sigma: the first standard deviation, as a share of each range.
+    noisy: learn slowly, for losses with noise. A search grows every design on the same seeds, so
+    its losses have none; those of a user's own function may. restarts: when a distribution has
     converged, begin another with twice the population (IPOP: Auger and Hansen, CEC 2005), at most
-    16 times the first; False keeps the first cloud.
+    16 times the first; False keeps the first.
 
-    Every cloud begins at the best of a batch of Sobol points. No cloud begins while these are all
-    equally good, as where every design fails. A cloud that ended where all losses are equal and
+    Every distribution begins at the best of a batch of Sobol points, and none while these are all
+    equally good, as where every design fails. One that ended where all losses are equal and
     worse than at its start is followed by one of the same size. Levels are whole numbers for cma,
     in their order, with its lower bounds on their widths and its centring (Marty et al., PPSN
     2024). Dimensions with one level are left out. Where fewer than the two dimensions that cma

@@ -15,7 +15,7 @@ from torchfilm import checks
 
 @dataclass(kw_only=True, eq=False)
 class Polish(AskTell):
-    """Searches with another method, and then goes down the slope from its best designs.
+    """Searches with another method, and then follows gradients from its best designs.
 
     inner: the method that searches first; None is Racing(). after: designs that it grows before, in
     units of full colonies with all replicates; one at least is grown to full size. starts: the best

@@ -40,7 +40,7 @@ def crowd(count: int, per_step: float = 0.1, givers: int = 1, **options) -> tf.S
 @pytest.mark.parametrize("backend", [None, "torch"])
 @pytest.mark.parametrize("count, swing, off", [(1, 0.040, 0.004), (5, 0.187, 0.088)])
 def test_the_swing_is_about_the_error(count, swing, off, backend):
-    """The table in docs/signals.md, whose third row takes longer."""
+    """The table in docs/exchange.md, whose third row takes longer."""
     scene = crowd(count, backend=backend)
     first = scene.bind(dtype=F64).start()
     state = advance(scene, first, 40, DT)

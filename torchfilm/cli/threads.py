@@ -1,4 +1,4 @@
-"""How many threads a command computes with. The library itself leaves torch's number as it is."""
+"""How many threads a command computes with."""
 
 from __future__ import annotations
 
