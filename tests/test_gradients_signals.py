@@ -108,7 +108,7 @@ def run(scene: tf.Scene, steps: int, colonies: int = 1) -> tf.State:
         assert all(bool((r.status == 0).all()) for r in state.reports.values())
         if "circuit" in state.reports and state.cells:
             parts = next(e.steps for e in scene.effects if isinstance(e, tf.Medium))
-            turns = max(parts, *(e.turns for e in model.effects))
+            turns = max(parts, *(e.plan.turns for e in model.effects))
             assert int(state.reports["circuit"].steps.max()) == turns, (
                 "the difference would see other steps"
             )

@@ -426,8 +426,8 @@ def test_what_mechanics_decided_is_decided_anew_by_others():
         ).replace(tf.Mechanics(dim=3))  # fmt: skip
 
 
-@pytest.mark.parametrize("dt", [0.0, -0.1, float("nan"), "a"])
-def test_a_step_takes_time(dt):
+@pytest.mark.parametrize("dt", [-0.1, float("nan"), "a"])
+def test_a_step_goes_forwards(dt):
     model = tf.Scene(tf.Growth(rate=1.0), dim=2).bind()
     with pytest.raises(tf.InputError, match=r"^dt = "):
         model.step(model.start(), dt)

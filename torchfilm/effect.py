@@ -247,6 +247,19 @@ class Effect(metaclass=checks.KnownKeywords):
         return ()
 
 
+@dataclass(frozen=True)
+class ExchangePlan:
+    """How an effect exchanges signals with the medium, as the medium decides at binding.
+
+    transport: by which the effect moves these signals itself; None: the medium moves them. turns:
+    of exchange and transport in a step. shared: signals that nutrition exchanges, too.
+    """
+
+    transport: Any = None
+    turns: int = 1
+    shared: frozenset[str] = frozenset()
+
+
 class BoundEffect:
     """An effect made ready for one batch. `values`: its physical values, resolved.
 
@@ -258,15 +271,17 @@ class BoundEffect:
     - `model.start()`: `lay`, then fields are declared, `ready`.
     - `model.step(state)`: `opened`, `run_step`.
 
-    What a step has to report it leaves in `state.reports`, by title: see `Report`.
+    What a step has to report it leaves in `state.reports`, by title: see `Report`. moves_signals:
+    whether it always moves the signals that it exchanges.
     """
+
+    moves_signals: ClassVar[bool] = False
 
     def __init__(self, effect: Effect, binding: Binding):
         self.effect, self.binding = effect, binding
         self.title, self.stage = effect.title, effect.stage
         self.place = 0  # of the effect in its scene
-        self.turns = 1  # of exchange with the medium in a step
-        self.eaten_too: frozenset[str] = frozenset()  # signals that nutrition exchanges, too
+        self.plan = ExchangePlan()
         self.values = Values(self._resolve(effect, binding.batch))
 
     @staticmethod
@@ -378,13 +393,8 @@ class BoundEffect:
         return one_torch_thread() if alone else given_torch_threads()
 
     def exchanges(self) -> tuple[str, ...]:
-        """The signals that it makes cells exchange with the medium, in one or more `turns`."""
+        """The signals that it makes cells exchange with the medium, as its `plan` says."""
         return ()
-
-    def moves_by(self, transport: Any) -> bool:
-        """Whether it moves the signals that it exchanges itself, by the medium's transport. None:
-        it is to leave that to the medium."""
-        return False
 
     @property
     def why_turns(self) -> str:

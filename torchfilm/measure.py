@@ -74,7 +74,7 @@ def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
     deep = depth > 0
     pairs = Groups(state.colony.index_select(0, i[deep]), state.colonies)
     count = pairs.counts
-    mean = pairs.sum(depth[deep].unsqueeze(1)).squeeze(1) / count.clamp(min=1)
+    mean = pairs.sum(depth[deep]) / count.clamp(min=1)
     placed = (state.position, axis, length, radius, state.own_colony_id)
     at_walls = depth_in_walls(walls, *placed)
     return Overlap(mean, pairs.max(depth[deep]), count, state.groups.max(at_walls))

@@ -165,7 +165,7 @@ class MediumExchange:
             for n, x in self._given.items()
         }
         for name, amount in self._to_reservoir.items():
-            total = state.groups.sum(amount.unsqueeze(1)).squeeze(1)
+            total = state.groups.sum(amount)
             changed[f"{name}_reservoir"] = state.fields[f"{name}_reservoir"] + total
         return state.with_fields(**changed, **more)
 

@@ -94,12 +94,12 @@ class Model:
     def step(self, state: State, dt: float | None = None, timings: Timings | None = None) -> State:
         """The state dt hours later (by default the scene's step): each effect in turn."""
         after_fork()
-        dt = self.dt if dt is None else checks.number("dt", dt, above=0.0)
+        dt = self.dt if dt is None else checks.number("dt", dt, least=0.0)
         state = self.opened(state)
         # torch's threads are set once a step, not once an effect
         alone = one_torch_thread() if self._by_kernels else nullcontext()
         with alone, once(self._said) as self._said:
-            for effect in self._parts:
+            for effect in self._joined_parts:
                 state = effect.run_step(state, dt, timings)
         return advanced(state, dt)
 
@@ -112,14 +112,14 @@ class Model:
         return state
 
     @cached_property
-    def turns(self) -> list[BoundEffect | Turns | Together]:
+    def step_parts(self) -> list[BoundEffect | Turns | Together]:
         """The effects in the order of a step, some of them in turns."""
         return in_turns(self.effects)
 
     @cached_property
-    def _parts(self) -> list[BoundEffect | JoinedStep | Turns | Together]:
+    def _joined_parts(self) -> list[BoundEffect | JoinedStep | Turns | Together]:
         """What a step runs: these, some of them joined."""
-        return joined(self.turns)
+        return joined(self.step_parts)
 
     @cached_property
     def _openers(self) -> list[BoundEffect]:

@@ -146,7 +146,7 @@ class GrowthRecording(metaclass=checks.KnownKeywords):
             kept = state.remove(full.index_select(0, state.colony), "left").replace(ended=())
             noted.append(_change(FIRST, state, kept))
             state = kept
-        for part, effect in enumerate(self.model.turns):
+        for part, effect in enumerate(self.model.step_parts):
             after = effect.run_step(state, self.dt)
             if after is not state:
                 noted.append(_change(part, state, after))
@@ -253,9 +253,9 @@ class Replay(metaclass=checks.KnownKeywords):
         device = recording.state.device
         self.streams, self.order = torch.sort(torch.tensor(recording.streams, device=device))
         # each effect with its number among the recorded ones, or None if it only follows
-        numbers = iter(range(len(recording.model.turns)))
+        numbers = iter(range(len(recording.model.step_parts)))
         self.parts = [
-            (e, next(numbers) if e.place in model.recorded else None) for e in model.turns
+            (e, next(numbers) if e.place in model.recorded else None) for e in model.step_parts
         ]
         # fields of those that only follow; what a recorded effect declares as well is recorded
         recorded = {f.name for e in recording.model.effects for f in e.declares()}

@@ -241,7 +241,7 @@ class CellsView(Draws):
     def colony_sum(self, value: Tensor) -> Tensor:
         """The sum over each cell's own colony, (N,) -> (N,); of a condition, how many fulfil it."""
         value = real_column("colony_sum", value, self._state)
-        total = self._state.groups.sum(value.unsqueeze(1)).squeeze(1)
+        total = self._state.groups.sum(value)
         return total.index_select(0, self._state.colony)
 
     def contacts(self, within: float = 0.05) -> tuple[Tensor, Tensor]:

@@ -150,7 +150,7 @@ class Together:
         changed = {}
         overdrawn = torch.zeros_like(fixed.failed, dtype=torch.float64)
         wanted = torch.zeros_like(overdrawn)
-        total = lambda amount: state.groups.sum(amount.unsqueeze(1)).squeeze(1)
+        total = lambda amount: state.groups.sum(amount)
         for name, moved in outcome.moved.items():
             old, released = state.fields[OUTSIDE + name], outcome.released[name].double()
             end, beyond = step.transport[name].settled(moved, released)

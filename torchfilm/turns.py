@@ -44,7 +44,7 @@ def in_turns(effects: Sequence[BoundEffect]) -> list[BoundEffect | Turns | Toget
     media = [e for e in effects if isinstance(e, BoundMedium)]
     joint = media and media[0].solves_together
     circuits = [e for e in effects if isinstance(e, BoundCircuit)]
-    circuits = [e for e in circuits if (joins(e, circuits) if joint else e.turns > 1)]
+    circuits = [e for e in circuits if (joins(e, circuits) if joint else e.plan.turns > 1)]
     found: list[BoundEffect | Turns | Together] = []
     for effect in effects:
         if circuits and effect is circuits[-1]:

@@ -72,7 +72,6 @@ class BoundCircuit(BoundEffect):
         self.traced_reads: tuple[str, ...] = ()
         self.signals: tuple[str, ...] = ()  # that rates read or change
         self.fields = tuple(effect.variables.values())
-        self.transport: Any = None  # where it is solved together with it
 
     # --- binding -------------------------------------------------------------------------
 
@@ -228,11 +227,12 @@ class BoundCircuit(BoundEffect):
         return [self.by_torch] if self.by_torch else parts
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        exchanged = () if self.transport else self.exchanges()
-        lines = methods_of(self.effect, dt, self.turns, self._why_torch(), exchanged)
-        if self.transport:
-            dt = dt / self.transport.medium.steps
-            rates = {n: self.transport.exchanges_per_hour(n, state) for n in self.exchanges()}
+        transport = self.plan.transport  # where it is solved together with circuits
+        exchanged = () if transport else self.exchanges()
+        lines = methods_of(self.effect, dt, self.plan.turns, self._why_torch(), exchanged)
+        if transport:
+            dt = dt / transport.medium.steps
+            rates = {n: transport.exchanges_per_hour(n, state) for n in self.exchanges()}
             lines += together_lines({n: x * dt for n, x in rates.items()})
         return lines
 
@@ -241,10 +241,6 @@ class BoundCircuit(BoundEffect):
         method = self.effect.method
         jumps = f"Circuit.method = {method!r} makes amounts that jump: no equation can be solved."
         return jumps if self.effect.is_stochastic else ""
-
-    def moves_by(self, transport: Any) -> bool:
-        self.transport = transport
-        return transport is not None
 
     # --- stepping ------------------------------------------------------------------------
 
@@ -270,7 +266,9 @@ class BoundCircuit(BoundEffect):
         noted: Mapping[str, Any] | None = None,
     ) -> State:  # fmt: skip
         """The state with the report of a turn added to those that are `done`. noted: more of it."""
-        made = dataclasses.replace(report.report(exchanged), shared=self.eaten_too, **(noted or {}))
+        made = dataclasses.replace(
+            report.report(exchanged), shared=self.plan.shared, **(noted or {})
+        )
         made = made.after(state.reports[self.title]) if done else made
         return state.replace(reports={**state.reports, self.title: made})
 

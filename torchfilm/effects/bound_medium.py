@@ -18,6 +18,7 @@ from torchfilm.effect import (
     GRID_COVERAGE,
     Binding,
     BoundEffect,
+    ExchangePlan,
 )  # fmt: skip
 from torchfilm.effects.medium_transport import Transport
 from torchfilm.signals.exchange import spans
@@ -164,7 +165,8 @@ class BoundMedium(_MediumPart):
         others = [e for e in effects if e.place != self.place and e.stage > BEFORE_CELLS]
         circuits = [e for e in others if e.stage == CIRCUIT]
         exchanged = lambda by: dict.fromkeys(n for e in by for n in e.exchanges())
-        eaten = exchanged(e for e in others if e not in circuits and e.moves_by(self.transport))
+        eaters = [e for e in others if e.moves_signals]
+        eaten = exchanged(eaters)
         given = exchanged(circuits)
         why = next((why for e in circuits if e.exchanges() and (why := e.why_turns)), "")
         if both := [n for n in given if n in eaten]:
@@ -177,10 +179,12 @@ class BoundMedium(_MediumPart):
         self.solves_together = joint
         self.transport.coupled = dict.fromkeys(eaten, "nutrition")
         self.transport.in_turns = frozenset()
+        for effect in eaters:
+            effect.plan = ExchangePlan(self.transport)
         for effect in circuits:
-            effect.moves_by(self.transport if joint and effect.exchanges() else None)
-            effect.turns = self.effect.steps if given and not joint else 1
-            effect.eaten_too = frozenset(both)
+            together = self.transport if joint and effect.exchanges() else None
+            turns = self.effect.steps if given and not joint else 1
+            effect.plan = ExchangePlan(together, turns, frozenset(both))
         if joint:
             self.transport.coupled |= dict.fromkeys(given, "circuits")
         elif given:

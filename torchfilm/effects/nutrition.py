@@ -151,7 +151,12 @@ class BoundMonod(BoundEffect):
     """Monod bound to a batch; it also reads and writes the reservoir's field, if there is one."""
 
     effect: Monod
-    transport: Any  # of the medium, which gives it before the first step
+    moves_signals = True
+
+    @property
+    def transport(self) -> Any:
+        """Of the medium."""
+        return self.plan.transport
 
     @property
     def by_kernels(self) -> bool:
@@ -187,10 +192,6 @@ class BoundMonod(BoundEffect):
 
     def exchanges(self) -> tuple[str, ...]:
         return (self.effect.signal,)
-
-    def moves_by(self, transport: Any) -> bool:
-        self.transport = transport
-        return True
 
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         for other in effects:
@@ -231,7 +232,7 @@ class BoundMonod(BoundEffect):
             "growth_rate": earlier + grown,
             own: state.fields[own] + taken.amount,
         }
-        total = lambda amount: state.groups.sum(amount.unsqueeze(1)).squeeze(1)
+        total = lambda amount: state.groups.sum(amount)
         for name in self._reservoir():
             changed[name] = state.fields[name] - total(torch.where(eaters.fed, 0.0, taken.amount))
         changed = {n: x.to(state.fields[n].dtype) for n, x in changed.items()}

@@ -89,7 +89,7 @@ def note_deeply_overlapping(
         return report
     deep = (pairs.gap < -0.5 * (pairs.a.radius + pairs.b.radius)).repeat(2)
     mark = marked(cells.radius.numel(), torch.cat([pairs.first, pairs.second]), deep)
-    found = cells.groups.sum(mark.to(cells.radius.dtype).unsqueeze(1)).squeeze(1).long()
+    found = cells.groups.sum(mark.to(cells.radius.dtype)).long()
     return replace(report, deeply_overlapping=torch.where(active, found, report.deeply_overlapping))
 
 

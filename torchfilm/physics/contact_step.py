@@ -74,7 +74,7 @@ def contact_step(
         start = cells.start if number == 0 else None
         move, solved = solve_among(cells, problem, moving, which, start)
         at = move_cells(cells, at, move, base, moving, solved)
-        clipped = cells.groups.sum(at.clipped.to(base.dtype).unsqueeze(1)).squeeze(1).long()
+        clipped = cells.groups.sum(at.clipped.to(base.dtype)).long()
         report = report.with_solve(solved, clipped, active)
         if number == 0:
             first = torch.where(moving.unsqueeze(1), move.detach(), at.first_move)

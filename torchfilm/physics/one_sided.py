@@ -70,7 +70,7 @@ class _OneStep:
         self.given, self.groups, self.dim = given, given.groups, given.settings.dim
         self.growth, self.active = growth, active
         count = self.groups.counts.clamp(min=1)
-        mean = lambda x: self.groups.sum(x.double().unsqueeze(1)).squeeze(1) / count
+        mean = lambda x: self.groups.sum(x.double()) / count
         self.wide = mean(given.radius)
         yielding = given.settings.contact_overlap
         self.target = yielding * self.wide
@@ -155,7 +155,7 @@ class _OneStep:
         deep = gap < -0.5 * (pairs.a.radius + pairs.b.radius)
         both = torch.cat([pairs.first, pairs.second])
         mark = marked(self.given.radius.numel(), both, deep.repeat(2))
-        found = self.groups.sum(mark.to(gap.dtype).unsqueeze(1)).squeeze(1).long()
+        found = self.groups.sum(mark.to(gap.dtype)).long()
         return torch.where(active, found, at.deeply_overlapping)
 
     def _deep_cells(self, pairs, gap: Tensor, walls: WallContacts, hops: int) -> Tensor:
@@ -369,7 +369,7 @@ class _OneStep:
         axis = torch.where(moving.unsqueeze(1), capsule.rotate(at.axis, made[:, dim:-1]), at.axis)
         length = at.length + made[:, -1]
         length = torch.where(length >= least, length, least)
-        count = self.groups.sum(clipped.to(move.dtype).unsqueeze(1)).squeeze(1).long()
+        count = self.groups.sum(clipped.to(move.dtype)).long()
         some = self.groups.any(moving)
         return replace(
             at,

@@ -158,7 +158,7 @@ def _look(problem: ContactProblem, here: _Point, cap: Tensor) -> _Look:
     z = Blocks(inverse).times(gradient)
     limits = cap.index_select(0, rows.owner).square()
     squares = torch.minimum((after * active).square().double(), limits)
-    overlap = rows.sum(squares.unsqueeze(1)).squeeze(1)
+    overlap = rows.sum(squares)
     residual = colonies.sum((gradient * z).double().sum(1, keepdim=True)).squeeze(1)
     downhill = torch.where(alone, gradient[:, -1] / own, 0.0)
     of_alone = (downhill * gradient[:, -1]).double().unsqueeze(1)

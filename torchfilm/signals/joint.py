@@ -167,8 +167,8 @@ class JointTransport:
         if not bool((missing > 0).any()):
             return end, none
         of_grids = Groups(self.grid.owner, self.groups.size, ordered=True)
-        content = of_grids.sum(end.unsqueeze(1)).squeeze(1) * self.grid.voxel_volume
-        missing = self.groups.sum(missing.unsqueeze(1)).squeeze(1)
+        content = of_grids.sum(end) * self.grid.voxel_volume
+        missing = self.groups.sum(missing)
         kept = (1 - missing / content.clamp(min=TINY)).clamp(min=0.0)
         kept = torch.where(missing > 0, kept, 1.0)
         return end * kept.index_select(0, self.grid.owner), (missing - content).clamp(min=0.0)

@@ -106,7 +106,7 @@ class _Iteration:
         residual, groups = new - x, self.groups
         square = (residual * weight) ** 2
         square = square if x.dim() == 1 else sum_in_order(square.flatten(1))
-        norm = groups.sum(square.unsqueeze(1)).squeeze(1)
+        norm = groups.sum(square)
         worse = far & ~(norm <= WORSE * self.least)
         better = norm < self.least
         self.part = torch.where(worse, 0.5 * self.part, self.part)

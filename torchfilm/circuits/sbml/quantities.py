@@ -206,15 +206,12 @@ class Quantities:
     def given_stoichiometry(reference: Any) -> float:
         level = reference.getLevel()
         if level > 2 and not reference.isSetStoichiometry():
-            raise InputError(
-                f"the stoichiometry of {reference.getSpecies()!r} is not given: give a number"
-            )
+            what = f"the stoichiometry of {reference.getSpecies()!r}"
+            raise InputError(f"{what} is not given: give a number")
         found = float(reference.getStoichiometry()) / (reference.getDenominator() or 1)
         if not 0 <= found < float("inf"):
-            raise InputError(
-                f"the stoichiometry of {reference.getSpecies()!r} is {found:g}: it must be a number"
-                " of at least 0"
-            )
+            said = f"the stoichiometry of {reference.getSpecies()!r} is {found:g}"
+            raise InputError(f"{said}: it must be a number of at least 0")
         return found
 
     def law(self, name: str) -> float | Expression:
@@ -325,10 +322,8 @@ class Quantities:
         self.used.add(name)
         if name in chosen:
             if not plain(chosen[name]):
-                raise InputError(
-                    f"the model computes first values from {name!r}, so it must be one number here:"
-                    " give the first values that depend on it by initial={…}"
-                )
+                what = f"the model computes first values from {name!r}, so it must be one number"
+                raise InputError(f"{what} here: give what depends on it by initial={{…}}")
             return float(chosen[name])
         at_start = _Start(self)
         for formula in (self.initial.get(name), self.assigned.get(name)):
@@ -356,9 +351,8 @@ class Quantities:
         elif species.isSetInitialConcentration():
             found, is_amount = species.getInitialConcentration(), False
         else:
-            raise InputError(
-                f"the species {name!r} has no first value: give initial={{{name!r}: …}}"
-            )
+            what = f"the species {name!r} has no first value"
+            raise InputError(f"{what}: give initial={{{name!r}: …}}")
         if is_amount == amounts:
             return float(found)
         size = float(_Start(self).size(species))
