@@ -12,7 +12,18 @@ from design.front import Front
 from design.growing import FinishedColonies
 from design.inference import infer
 from design.library import Library, Sensor, SensorDevice, Wiring
-from design.methods import CMAES, NSGA2, Batch, Bayesian, Local, Method, Polish, Racing, Sobol
+from design.methods import (
+    CMAES,
+    NSGA2,
+    Batch,
+    Bayesian,
+    Exhaustive,
+    Local,
+    Method,
+    Polish,
+    Racing,
+    Sobol,
+)
 from design.objective import Evaluation, Objective
 from design.parameters import Choice, Parameter, Space
 from design.posterior import Posterior
@@ -61,6 +72,7 @@ __all__ = [
     "DomainSize",
     "Duration",
     "Evaluation",
+    "Exhaustive",
     "Finals",
     "FinishedColonies",
     "Front",

@@ -2,7 +2,8 @@
 
 The lowest of many losses is low partly by luck. So the last part of the budget goes to the best
 designs on seeds that the search has not used: half of them drop out after each round, and the
-seeds of the others double (successive halving; Karnin, Koren and Somekh, ICML 2013).
+seeds of the others double (successive halving; Karnin, Koren and Somekh, ICML 2013). The winner of
+these is lucky on them, too, so that its loss and band come from other seeds, of a last check.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ from design.task import Task
 from torchfilm import checks
 
 FIRST_STREAM = 1_000_000  # beyond the streams of searches and robustness checks
+CHECK_STREAM = 2_000_000  # of the check of the winner
+CHECK = 1 / 3  # of the colonies of finals with several designs
+MOST_SHARE = 0.9  # of a budget
 LEAST = 4  # fresh seeds of a finalist
 ALIKE = 0.02  # designs that are nearer in every coordinate count as one
 HOLDS = (8, 24)  # fresh seeds of a design that may hold the wanted loss: first, then in all
@@ -44,7 +48,7 @@ class Finals(metaclass=checks.KnownKeywords):
     sizes: Sequence[float] = (1.0,)
 
     def __post_init__(self) -> None:
-        checks.number("Finals.share", self.share, above=0.0, most=0.9)
+        checks.number("Finals.share", self.share, above=0.0, most=MOST_SHARE)
         object.__setattr__(self, "most", checks.integer("Finals.most", self.most, least=1))
         sizes = checks.vector("Finals.sizes", self.sizes)
         if not sizes or min(sizes) <= 0 or len(set(sizes)) < len(sizes):
@@ -56,20 +60,31 @@ class Finals(metaclass=checks.KnownKeywords):
     def rounds(self, budget: float) -> list[tuple[int, int]]:
         """The finalists of each round and their fresh seeds so far, for a search of `budget`
         colonies; [] where its share is too small for one design."""
-        count, colonies = self.most, self.share * budget / sum(self.sizes)
+        count = self.most
         while count:
             counts = [count]
             while counts[-1] // 2 >= 2:
                 counts.append(counts[-1] // 2)
-            seeds = int(colonies / sum(c * 2**r for r, c in enumerate(counts)))
+            colonies = self._rows(budget) * (1 if count == 1 else 1 - CHECK)
+            seeds = int(colonies / sum(c * 2**r for r, c in enumerate(counts)) + 1e-9)
             if seeds >= LEAST:
                 return [(c, seeds * (2 ** (r + 1) - 1)) for r, c in enumerate(counts)]
             count //= 2
         return []
 
+    def check_seeds(self, budget: float) -> int:
+        """Fresh seeds of the check of the winner, which no round has used; 0 where one finalist has
+        won by the seeds of the search alone."""
+        several = any(count > 1 for count, _ in self.rounds(budget))
+        return int(CHECK * self._rows(budget) + 1e-9) if several else 0
+
+    def _rows(self, budget: float) -> float:
+        """Designs, each on one seed at all sizes, that the share of a budget allows."""
+        return self.share * budget / sum(self.sizes)
+
     def colonies(self, budget: float) -> float:
         """Colonies of the finals of a search of `budget` colonies."""
-        total, before = 0, 0
+        total, before = self.check_seeds(budget), 0
         for count, seeds in self.rounds(budget):
             total, before = total + count * (seeds - before), seeds
         return total * sum(self.sizes)
@@ -78,7 +93,8 @@ class Finals(metaclass=checks.KnownKeywords):
 @dataclass(frozen=True, eq=False)
 class FreshLosses:
     """A design on fresh seeds: losses (S,) of each, the worst of its sizes; loss: what they reduce
-    to; band: where that lies with a probability of 90 %."""
+    to; band: where that lies with a probability of 90 %, unless the design was chosen by these
+    losses."""
 
     losses: np.ndarray
     loss: float
@@ -88,8 +104,17 @@ class FreshLosses:
 def fresh_losses(
     task: Task, study: Study, sizes: Sequence[float], point: np.ndarray
 ) -> FreshLosses | None:
-    """Of a design (D,); None before it was grown on LEAST seeds at all sizes."""
-    losses = worst_of_sizes([_tested(study, point, size) for size in sizes])
+    """Of a design (D,), those of the check where it was checked; None before it was grown on LEAST
+    seeds at all sizes."""
+    checked = _fresh(task, study, sizes, point, CHECK_STREAM)
+    return checked or _fresh(task, study, sizes, point, FIRST_STREAM)
+
+
+def _fresh(
+    task: Task, study: Study, sizes: Sequence[float], point: np.ndarray, first: int
+) -> FreshLosses | None:
+    """Of the seeds from `first` on."""
+    losses = worst_of_sizes([_tested(study, point, size, first=first) for size in sizes])
     if len(losses) < LEAST:
         return None
     return FreshLosses(losses, float(task.reduced(losses[None])[0]), _band(task, losses))
@@ -121,13 +146,16 @@ def worst_of_sizes(each: Sequence[np.ndarray]) -> np.ndarray:
     return np.asarray(np.max([x[:seeds] for x in each], axis=0))
 
 
-def _tested(study: Study, point: np.ndarray, size: float, name: str = "losses") -> np.ndarray:
-    """The losses of a design (D,) on the first fresh seeds at a size, (S,); or its "each_goals",
-    (S, G)."""
+def _tested(
+    study: Study, point: np.ndarray, size: float, name: str = "losses", first: int = FIRST_STREAM
+) -> np.ndarray:
+    """The losses of a design (D,) on the fresh seeds from `first` on at a size, (S,); or its
+    "each_goals", (S, G)."""
     found = [
         getattr(e, name)[k]
         for e in study.finals
         if e.size == size and getattr(e, name) is not None
+        if (e.streams[0] >= CHECK_STREAM) == (first == CHECK_STREAM)
         for k in np.flatnonzero((e.points == point).all(1))
     ]
     return np.concatenate(found) if found else np.empty(0)
@@ -154,7 +182,7 @@ def winner(task: Task, study: Study, sizes: Sequence[float]) -> np.ndarray | Non
     But few seeds make a low quantile. So elsewhere a design must also be as good as those with
     fewer seeds on the seeds of these. None before a design was grown on fresh seeds."""
     points = {p.tobytes(): p for e in study.finals for p in e.points}
-    found = ((fresh_losses(task, study, sizes, p), p) for p in points.values())
+    found = ((_fresh(task, study, sizes, p, FIRST_STREAM), p) for p in points.values())
     known = [(fresh, p) for fresh, p in found if fresh is not None]
     # where every colony fails, a narrow band says nothing
     ends = lambda x: (bool((x[0].losses == task.target.failed).all()), x[0].band[1])
@@ -195,6 +223,9 @@ class FinalsRun:
         for count, seeds in self.finals.rounds(self.budget):
             chosen = self._grow(chosen[:count], seeds)
             chosen = sorted(chosen, key=partial(self._loss, seeds))
+        best = winner(self.task, self.study, self.finals.sizes)
+        if best is not None and (seeds := self.finals.check_seeds(self.budget)):
+            self._grow([best], seeds, CHECK_STREAM)
 
     def holds(self, wanted: float) -> bool:
         """Whether one of the best designs, of all and of the last batch, holds a loss on fresh
@@ -211,7 +242,7 @@ class FinalsRun:
         for seeds in HOLDS:
             if not self._grow([point], seeds) or self._loss(seeds, point) > wanted:
                 return False
-        found = fresh_losses(self.task, self.study, self.finals.sizes, point)
+        found = _fresh(self.task, self.study, self.finals.sizes, point, FIRST_STREAM)
         return found is not None and found.band[1] <= wanted
 
     def _front(self) -> None:
@@ -250,28 +281,31 @@ class FinalsRun:
                     break
         return out
 
-    def _grow(self, points: Sequence[np.ndarray], seeds: int) -> list[np.ndarray]:
-        """Grow designs on as many of the first fresh seeds as they lack, the best first, while the
-        budget lasts. Returns those that have been grown on all."""
+    def _grow(
+        self, points: Sequence[np.ndarray], seeds: int, first: int = FIRST_STREAM
+    ) -> list[np.ndarray]:
+        """Grow designs on as many of the fresh seeds from `first` on as they lack, the best first,
+        while the budget lasts. Returns those that have been grown on all."""
         lacking: dict[tuple[float, int], list[np.ndarray]] = {}
         done, spent = [], 0.0
         for point in points:
-            cost = self._cost(point, seeds)
+            cost = self._cost(point, seeds, first)
             if not self._affords(spent + cost):
                 break
             spent += cost
             done.append(point)
             for size in self.finals.sizes:
-                n = len(_tested(self.study, point, size))
+                n = len(_tested(self.study, point, size, first=first))
                 if n < seeds:
                     lacking.setdefault((size, n), []).append(point)
         for (size, known_seeds), group in lacking.items():
-            self._add(np.array(group), size, range(known_seeds, seeds))
+            self._add(np.array(group), size, range(first + known_seeds, first + seeds))
         return done
 
-    def _cost(self, point: np.ndarray, seeds: int) -> float:
+    def _cost(self, point: np.ndarray, seeds: int, first: int = FIRST_STREAM) -> float:
         """Colonies of a design that are lacking to as many fresh seeds."""
-        known = {size: len(_tested(self.study, point, size)) for size in self.finals.sizes}
+        sizes = self.finals.sizes
+        known = {size: len(_tested(self.study, point, size, first=first)) for size in sizes}
         return sum(size * max(0, seeds - n) for size, n in known.items())
 
     def _affords(self, cost: float) -> bool:
@@ -279,7 +313,7 @@ class FinalsRun:
 
     def _add(self, points: np.ndarray, size: float, seeds: range) -> None:
         objective = Objective(self.task if size == 1.0 else self.task.resized(size))
-        streams = tuple(FIRST_STREAM + k for k in seeds)
+        streams = tuple(seeds)
         found = objective.evaluate(
             points, streams=streams, executor=self.executor, work_items=self.work_items
         )

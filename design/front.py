@@ -20,7 +20,7 @@ from design.report import at_bound, cells_in, cost_words, failure_words
 from design.study import Study
 from design.targets.goals import Constrained, Goals, in_words, of_seeds
 from design.trivial import trivial_losses
-from torchfilm import displays
+from torchfilm import checks, displays
 
 
 class FrontSearch(Protocol):
@@ -40,8 +40,9 @@ class Front:
     """Designs that no other exceeds in all goals, in order of the first goal.
 
     search: that found them; titles: of the goals; points (F, D); goals (F, G): their losses; seeds:
-    fresh seeds on which these were measured, 0 where they are those of the search. `front[k]` is a
-    design as `Best`, with `save`, `colonies`, `table`.
+    fresh seeds on which these were measured, 0 where they are those of the search. untested:
+    further designs of the front of the search, for which the finals had no room; `search.front(
+    fresh=False)` has all. `front[k]` is a design as `Best`, with `save`, `colonies`, `table`.
     """
 
     search: FrontSearch = field(repr=False)
@@ -49,6 +50,7 @@ class Front:
     points: np.ndarray = field(repr=False)
     goals: np.ndarray
     seeds: int
+    untested: int = 0
 
     def __len__(self) -> int:
         return len(self.points)
@@ -64,12 +66,14 @@ class Front:
         """The parameters of each design by name."""
         return [self.search.objective.task.space.values(point) for point in self.points]
 
-    def convergence(self) -> tuple[np.ndarray, np.ndarray]:
+    def convergence(
+        self, box: tuple[Sequence[float], Sequence[float]] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """After each batch of the search: the colonies simulated, and the hypervolume, (K,) each.
 
-        That is the part of a box that the front so far exceeds; the box reaches from the best to
-        the worst value of each goal on the front of the whole search (Zitzler and Thiele, 1999).
-        Needs pymoo (the `pareto` extra).
+        That is the part of a box that the front so far exceeds (Zitzler and Thiele, 1999). box: the
+        best and the worst value of each goal, (G,) each, to compare searches; by default those on
+        the front of the whole search. Needs pymoo (the `pareto` extra).
         """
         from pymoo.indicators.hv import HV
 
@@ -77,7 +81,7 @@ class Front:
         full = study.full_goals()
         every = np.concatenate([goals for _, goals in full])
         good = every[nondominated(every)]
-        low, high = good.min(0), good.max(0)
+        low, high = (good.min(0), good.max(0)) if box is None else _checked_box(box, good.shape[1])
         measure = HV(ref_point=np.ones(every.shape[1]))
         spent = np.cumsum([e.colonies for e in study.entries])
         found, known = [], np.empty((0, every.shape[1]))
@@ -135,7 +139,9 @@ class Front:
 
     def _where(self) -> str:
         where = f"on {self.seeds} fresh seeds" if self.seeds else "on the seeds of the search"
-        return f"{displays.counted(len(self), 'design', 'designs')}, {where}"
+        more = f"; {self.untested} more were not tested: search.front(fresh=False)"
+        count = displays.counted(len(self), "design", "designs")
+        return f"{count}, {where}{more if self.untested else ''}"
 
     def __repr__(self) -> str:
         return f"Front({', '.join(self.titles)}; {self._where()})"
@@ -156,9 +162,23 @@ class Front:
         return tf.pictures.Picture(figure, out)
 
 
+def _checked_box(box: Any, goals: int) -> tuple[np.ndarray, np.ndarray]:
+    """The corners of a box, of so many goals."""
+    pair = isinstance(box, (tuple, list)) and len(box) == 2
+    each = [checks.vector("convergence(box)", x, goals) for x in box] if pair else []
+    if not each or any(a >= b for a, b in zip(*each, strict=True)):
+        raise checks.input_error(
+            "convergence(box)",
+            box,
+            "the best and the worst value of each goal, such as ((0.0, 1.0), (1.0, 9.0))",
+        )
+    return np.array(each[0]), np.array(each[1])
+
+
 def front_of(search: FrontSearch, study: Study, sizes: Sequence[float]) -> Front:
-    """The front of a study: on fresh seeds where its designs were grown at all these sizes. Raises
-    InputError before a design was grown to full size, and where all failed."""
+    """The front of a study: on fresh seeds where its designs were grown at all these sizes, else on
+    the seeds of the search. Raises InputError before a design was grown to full size, and where all
+    failed."""
     target = search.objective.task.target
     assert isinstance(target, Goals)
     full = study.full_goals()
@@ -167,13 +187,14 @@ def front_of(search: FrontSearch, study: Study, sizes: Sequence[float]) -> Front
             "no design has been grown to full size yet: run the search for more colonies."
         )
     fresh = fresh_goals(search.objective.task, study, sizes) if sizes else None
-    seeds = 0
-    if fresh is None:
-        points = np.concatenate([e.points for e, _ in full])
-        goals = np.concatenate([g for _, g in full])
-    else:
+    seeds = untested = 0
+    points = np.concatenate([e.points for e, _ in full])
+    goals = np.concatenate([g for _, g in full])
+    if fresh is not None:
+        known = {p.tobytes() for p in points[nondominated(goals)]}
         points, goals, seeds = fresh
+        untested = len(known - {p.tobytes() for p in points})
     rows = nondominated(goals)
     if not len(rows):
         raise tf.InputError(f"every design failed: {study.failures()[0][0]}")
-    return Front(search, target.titles, points[rows], goals[rows], seeds)
+    return Front(search, target.titles, points[rows], goals[rows], seeds, untested)

@@ -226,8 +226,12 @@ class Space(metaclass=checks.KnownKeywords):
 
     def values(self, point: np.ndarray) -> dict[str, Value]:
         """The values of one design by name, from its coordinates (D,)."""
+        wanted = f"{self.size} coordinates in [0, 1]"
         if np.shape(point) != (self.size,):
-            raise checks.input_error("point", point, f"{self.size} coordinates in [0, 1]")
+            raise checks.input_error("point", point, wanted)
+        far = [float(u) for u in point if not -1e-9 <= u <= 1 + 1e-9]  # rounding is none
+        if far:
+            raise checks.input_error("point", far[0], wanted)
         return self.resolved(
             {p.name: p.value(float(u)) for p, u in zip(self.parameters, point, strict=True)}
         )

@@ -177,7 +177,7 @@ def try_scenes(
         made_of.append((scene.effects, scene.founders))
         stochastic |= _is_stochastic(scene)
         endless.append(tried.why_endless)
-        rough.append(why_rough(scene, tried.why_regrown))
+        rough.append(why_rough(scene, tried.why_regrown) or target.why_rough(tried.first))
     # one design that does not grow is scored as such; a search in which none grows is a mistake
     if example is None or all(endless):
         raise tf.InputError(unfit[0] if example is None else endless[0])

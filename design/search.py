@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,11 +13,11 @@ import numpy as np
 
 import torchfilm as tf
 from design.best import Best
-from design.finals import Finals, FinalsRun, fresh_losses, winner
+from design.finals import MOST_SHARE, Finals, FinalsRun, fresh_losses, winner
 from design.front import Front, front_of
 from design.growing import FinishedColonies
 from design.known import KnownDesigns, Start, known_designs
-from design.methods import METHODS, Chosen, Method, choose, method_of
+from design.methods import METHODS, Chosen, Method, choose, designs_of, method_of
 from design.objective import Objective
 from design.progress import advance, open_bar
 from design.proposal import Proposal, repeat_study
@@ -61,7 +61,9 @@ class Search(TaskOptions):
     None leaves this out. start: designs from which the search starts: their values by name, a
     `Best`, the file of a saved design, or a `Study` or its file. A study of the same task with
     other bounds, or without some of the parameters, keeps its losses; of any other designs the best
-    are grown again; `run` prints which are left out, and why. `TaskOptions` documents the other
+    are grown again; `run` prints which are left out, and why. method_seed: of what the method
+    draws, by default `seed`, which the colonies have; to compare methods on the same colonies.
+    `TaskOptions` documents the other
     arguments; `search.objective.task` holds them checked. Raises the errors of `Task`, and
     InputError for a method, finals or a start that are not allowed.
     """
@@ -69,6 +71,7 @@ class Search(TaskOptions):
     method: str | Method = field(default="auto", kw_only=True)
     finals: Finals | None = field(default_factory=Finals, kw_only=True)
     start: Start | None = field(default=None, kw_only=True, repr=False)
+    method_seed: int | None = field(default=None, kw_only=True)
     objective: Objective = field(init=False, repr=False)
     _known: KnownDesigns | None = field(init=False, repr=False)
     _progress: SearchProgress = field(init=False, repr=False)
@@ -77,6 +80,8 @@ class Search(TaskOptions):
         task = Task.of(self)
         if not isinstance(self.finals, Finals | None):
             raise checks.input_error("finals", self.finals, "Finals(…) or None")
+        if self.method_seed is not None:
+            checks.integer("method_seed", self.method_seed, least=0)
         known = None if self.start is None else known_designs(self.start, task)
         chosen = _check_method(self.method, task)
         for name, value in (
@@ -146,13 +151,26 @@ class Search(TaskOptions):
                     finals = FinalsRun(self.finals, *run)
                 holds = self._search(colonies, stop_at, finals, bar, executor, work_items)
                 if finals is not None and not holds:
-                    finals.run()
+                    self._with_all_left(finals, colonies).run()
                 _show(bar, self.study)
         except KeyboardInterrupt:
             self._report_interrupt(colonies)
             raise
         self._remark(colonies, holds)
         return self.front() if self.objective.task.goals else self.best()
+
+    def _with_all_left(self, finals: FinalsRun, colonies: int) -> FinalsRun:
+        """The finals, which take all that is left where the method has grown all its designs."""
+        if not self._is_over:
+            return finals
+        share = min(MOST_SHARE, 1.0 - self.study.searched / colonies)
+        return replace(finals, finals=replace(finals.finals, share=max(share, finals.finals.share)))
+
+    @property
+    def _is_over(self) -> bool:
+        """Whether the method of the run has nothing more to propose."""
+        assert self._progress.chosen is not None
+        return bool(getattr(self._progress.chosen.method, "over", False))
 
     def _remark(self, colonies: int, holds: bool) -> None:
         """Say what makes the outcome of a search worth little. holds: it found what was wanted."""
@@ -199,10 +217,13 @@ class Search(TaskOptions):
         task, method = self.objective.task, self._progress.chosen.method
         reserved = self.finals.colonies(colonies) if self.finals else 0.0
         limit = max(colonies - reserved, task.replicates)  # one design at least
-        method.start(task.space, task.seed, task.replicates)
+        seed = task.seed if self.method_seed is None else self.method_seed
+        method.start(task.space, seed, task.replicates)
         proposal = repeat_study(method, task, self.study, self._known)
         within_reach = check_within_reach(self.objective, self.study)
         while not self._reached(stop_at, finals):
+            if proposal is None and self._is_over:
+                return False
             proposal = proposal or Proposal.of_number(
                 len(self.study.entries), method, task, self._known
             )
@@ -250,13 +271,13 @@ class Search(TaskOptions):
             chosen = winner(self.objective.task, self.study, self.finals.sizes)
         return self.design(found[0] if chosen is None else chosen)
 
-    def front(self) -> Front:
+    def front(self, fresh: bool = True) -> Front:
         """The designs that no other exceeds in all goals: on fresh seeds, where designs were tested
-        on these. Raises InputError for a search with one target, and before a design was grown to
-        full size."""
+        on these; or all, on the seeds of the search. Raises InputError for a search with one
+        target, and before a design was grown to full size."""
         if not self.objective.task.goals:
             raise checks.input_error("front", "one target", "of several: give targets=[…]")
-        sizes = () if self.finals is None else self.finals.sizes
+        sizes = () if self.finals is None or not fresh else self.finals.sizes
         return front_of(self, self.study, sizes)
 
     def first(self) -> Best:
@@ -314,12 +335,15 @@ class Search(TaskOptions):
             task.tried.stochastic,
             task.replicates,
             before,
+            designs_of(task.space),
         )
 
     def _open_study(self, path: str | Path | None, method: str) -> Study:
         task = self.objective.task
         names = task.space.names
         about = task.describe() | {"names": list(names), "method": method}
+        if self.method_seed is not None:
+            about["method seed"] = self.method_seed
         if self._known is not None:
             about["start"] = self._known.describe()
         streams = task.streams(None)

@@ -13,6 +13,7 @@ import numpy as np
 
 import torchfilm as tf
 from design.entries import Entry
+from design.history import history_of, write_csv
 from design.parameters import right_aligned, show_value
 from design.study_file import StudyData, read_study, write_study
 from design.study_refusal import refusal
@@ -101,6 +102,20 @@ class Study:
         spread between replicates, cells, and the values of the parameters. most: rows."""
         text, more = self._rows(most)
         return "\n".join(right_aligned(text) + ([more] if more else []))
+
+    def history(self, path: str | Path | None = None) -> dict[str, list[Any]]:
+        """Every design that was grown, in order, as columns by name, for pandas or a plot: a row
+        for each design of each batch, `finals` true of those on fresh seeds.
+
+        size: share of the full size; replicates, and the first of their seeds; colonies: that it
+        cost; loss, and that of each replicate, `loss_0` …, NaN beyond; goals, `goal_0` …; how many
+        replicates failed, and why; cells, a mean; the parameters. A design that was grown with
+        derivatives has a row for these, too. path: of a new CSV file to write.
+        """
+        found = history_of(self.names, self.entries, self.finals)
+        if path is not None:
+            write_csv(path, found)
+        return found
 
     def _rows(self, most: int) -> tuple[list[list[str]], str]:
         """The rows of the table, its head first, and a line that says how many are left out."""

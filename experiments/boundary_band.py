@@ -3,7 +3,7 @@
     python experiments/boundary_band.py     # 8 seeds of 5,000 cells in 8 conditions
     python experiments/boundary_band.py --cells 500 --seeds 2
 
-The full run takes twelve minutes on one shared core. Each condition is one batch of colonies. The
+The full run takes four minutes on two shared cores. Each condition is one batch of colonies. The
 border of a colony is the place along the channel with the fewest cells on the wrong side. The sink
 cells are binned into strips by their distance from the border. The profile of mean YFP over these
 strips gives the band's peak, its place, its full width at half maximum and the middle of that. The

@@ -8,6 +8,7 @@ from design.methods.auto import Chosen, choose
 from design.methods.base import Batch, Method
 from design.methods.bayesian import Bayesian
 from design.methods.cmaes import CMAES
+from design.methods.exhaustive import Exhaustive, designs_of
 from design.methods.local import Local
 from design.methods.nsga2 import NSGA2
 from design.methods.polish import Polish
@@ -23,6 +24,7 @@ METHODS: dict[str, type[Any]] = {
     "local": Local,
     "polish": Polish,
     "nsga2": NSGA2,
+    "exhaustive": Exhaustive,
 }
 
 __all__ = [
@@ -32,12 +34,14 @@ __all__ = [
     "Batch",
     "Bayesian",
     "Chosen",
+    "Exhaustive",
     "Local",
     "Method",
     "Polish",
     "Racing",
     "Sobol",
     "choose",
+    "designs_of",
     "method_of",
 ]
 

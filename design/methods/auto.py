@@ -9,6 +9,7 @@ from typing import Any
 
 from design.methods.bayesian import Bayesian
 from design.methods.cmaes import CMAES
+from design.methods.exhaustive import Exhaustive
 from design.methods.nsga2 import NSGA2
 from design.methods.polish import Polish
 from design.methods.racing import Racing
@@ -18,6 +19,8 @@ BATCH, WIDTH = 24, 0.5
 # designs before the first descents (less than one race, whose end they await), and for each
 # parameter of a descent, so that it ends
 BEFORE, EACH, MOST_STARTS = 5, 10, 3
+# of the designs that a budget can grow, those that are left for the search
+GROWN = 0.8
 # designs of a batch of a race where every design needs many replicates
 FEW = 12
 # designs of a batch of a model, and at most in a search, since its time grows as the cube of all
@@ -53,20 +56,20 @@ def choose(
     chance: bool = False,
     replicates: int = 4,
     before: str = "",
+    different: float = math.inf,
 ) -> Chosen:
     """The method of a search that leaves the choice. dimensions: parameters; designs: that the
     budget can grow with all replicates; goals: 0 for one target; pattern: whether the target is a
     pattern, of which small colonies show something; squares: whether its loss is a sum of squares
     with exact derivatives; chance: whether molecules are counted one by one; replicates: of a
     design; before: what the study of a search that is resumed says of its method, which goes
-    on."""
+    on; different: designs in the space."""
     botorch, cloud = find_spec("botorch") is not None, CMAES(population=BATCH, sigma=WIDTH)
     alone = chance or not pattern  # the model draws all designs
     most, least = MODELLED if alone else RACED, LEAST_RACED if pattern else 0
     if botorch:
         least = _least_modelled(dimensions, replicates, alone)
-    whole = math.floor(designs)
-    about = f"{whole} designs for {dimensions} parameters"
+    about = f"{(whole := math.floor(designs))} designs for {dimensions} parameters"
     better = not botorch and designs <= most
     hint = " (with botorch installed, a model of the loss would)" if better else ""
     few = Chosen(
@@ -98,11 +101,14 @@ def choose(
         )
     descents = _descents(cloud, about)
     known = (few, race, *descents, *((learnt, modelled) if botorch else ()))
-    for chosen in known if before else ():
+    every = Chosen(Exhaustive(), f"{different:g} different designs: the budget grows each")
+    for chosen in (*known, every) if before else ():
         if chosen.describe() == before:
             return Chosen(chosen.method, "the study began with it")
     if goals:
         return Chosen(NSGA2(), f"{goals} goals side by side")
+    if different <= GROWN * designs:
+        return every
     if designs < least:
         return few
     room = int((designs - BEFORE) / (EACH * dimensions))

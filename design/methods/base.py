@@ -71,10 +71,11 @@ class Method(Protocol):
     The result of `ask` must depend only on the arguments of `start`, the method's settings, and all
     calls of `tell`: a new method resumes a stopped search from the batches and losses of its study.
     A method with `describe() -> str` is recognised when a search is resumed. One with a property
-    `remark` has it printed at the end of a run, unless it is "". One with `know(points,
-    loss)` learns before its first batch of the designs from which a search starts; `loss` is as for
-    `tell`. One with `recall(points)` is told, where a search is resumed, what its next `ask` gave
-    then (None: not known), and need not work it out again.
+    `remark` has it printed at the end of a run, unless it is "". One with a property `over` ends
+    the search where it is true, and what is left of the budget goes to the finals. One with
+    `know(points, loss)` learns before its first batch of the designs from which a search starts;
+    `loss` is as for `tell`. One with `recall(points)` is told, where a search is resumed, what its
+    next `ask` gave then (None: not known), and need not work it out again.
     """
 
     def start(self, space: Dimensions, seed: int, replicates: int) -> None: ...

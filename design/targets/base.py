@@ -90,6 +90,11 @@ class Target(metaclass=checks.KnownKeywords):
         """Whether the loss is a sum of squares, so that there are `residuals`."""
         return type(self).residuals is not Target.residuals
 
+    def why_rough(self, state: tf.State) -> str:
+        """Why the loss has no exact derivatives by what cells contain, as a first state shows; ""
+        where it has."""
+        return ""
+
     def reduced(self, losses: np.ndarray) -> np.ndarray | None:
         """One loss for each design, (n,), from those of its replicates (n, R); None: as the task
         says."""
@@ -199,11 +204,7 @@ def weights(state: tf.State) -> Tensor:
 
 def total(state: tf.State, value: Tensor) -> Tensor:
     """The sum over each colony of (N,) or (N, k): (B,) or (B, k)."""
-    return (
-        state.groups.sum(value.unsqueeze(1)).squeeze(1)
-        if value.dim() == 1
-        else state.groups.sum(value)
-    )
+    return state.groups.sum(value)
 
 
 def rows_of_colonies(state: tf.State, value: Tensor) -> Tensor:

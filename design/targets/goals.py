@@ -244,6 +244,16 @@ class Constrained(Several):
                     "Several have it: " + "; ".join(part.describe() for part in owners) + ".",
                 )
 
+    def why_rough(self, state: tf.State) -> str:
+        read = {n: x for n, x in state.fields.items() if n in self.names and x.is_floating_point()}
+        with torch.enable_grad():
+            moved = {n: x.detach().clone().requires_grad_() for n, x in read.items()}
+            each = self._measured(state.with_fields(**moved))
+        found = {name: x for measures in each for name, x in measures.items()}
+        lacking = [name for name in self.bounds if not found[name].requires_grad]
+        why = f"constraints on {' and '.join(lacking)} have no derivatives"
+        return why if lacking else super().why_rough(state)
+
     def _measured(self, state: tf.State) -> list[dict[str, Tensor]]:
         """Of a state alone: the measures of each part."""
         note = self.note(state)

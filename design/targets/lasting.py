@@ -57,6 +57,9 @@ class Lasting(Target):
             what = f"{type(self.target).__name__}, which has a history of its own"
             raise checks.input_error("Lasting.target", what, "a target of one state")
 
+    def why_rough(self, state: tf.State) -> str:
+        return self.target.why_rough(state)
+
     def unfit(self, state: tf.State) -> list[str]:
         return self.target.unfit(state)
 

@@ -55,6 +55,9 @@ class Several(Target):
                 " colony ends at one time: put them together as ObservedCourse([…])."
             )
 
+    def why_rough(self, state: tf.State) -> str:
+        return next(filter(None, (part.why_rough(state) for part in self.parts)), "")
+
     def unfit(self, state: tf.State) -> list[str]:
         return [
             next(filter(None, why), "")

@@ -7,12 +7,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 from searching import lit, mean
 
 import torchfilm as tf
 from design import Finals, Parameter, Search, Sobol, Study, Target
 from design.entries import Entry
-from design.finals import FIRST_STREAM, HOLDS, LEAST, winner
+from design.finals import CHECK_STREAM, FIRST_STREAM, HOLDS, LEAST, winner
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 
@@ -40,10 +41,10 @@ def search(target=None, **options):
 @pytest.mark.parametrize(
     "share, most, budget, expected",
     [
-        (0.2, 8, 2000, [(8, 16), (4, 48), (2, 112)]),
-        (0.2, 8, 800, [(8, 6), (4, 18), (2, 42)]),
-        (0.2, 8, 200, [(4, 5), (2, 15)]),
-        (0.2, 8, 60, [(2, 6)]),
+        (0.2, 8, 3000, [(8, 16), (4, 48), (2, 112)]),
+        (0.2, 8, 1200, [(8, 6), (4, 18), (2, 42)]),
+        (0.2, 8, 300, [(4, 5), (2, 15)]),
+        (0.2, 8, 90, [(2, 6)]),
         (0.2, 8, 20, [(1, 4)]),
         (0.2, 8, 19, []),
         (0.5, 1, 100, [(1, 50)]),
@@ -55,9 +56,11 @@ def test_rounds_halve_the_finalists_and_double_their_seeds(share, most, budget, 
     cost = finals.colonies(budget)
     assert cost <= share * budget
     seeds = [0, *(s for _, s in expected)]
-    assert cost == sum(
-        c * (now - then) for (c, now), then in zip(expected, seeds[:-1], strict=True)
-    )
+    rounds = sum(c * (now - then) for (c, now), then in zip(expected, seeds[:-1], strict=True))
+    checked = finals.check_seeds(budget)
+    assert cost == rounds + checked
+    several = any(c > 1 for c, _ in expected)
+    assert checked == (round(share * budget) // 3 if several else 0)
     assert Finals(share=share, most=most, sizes=(0.5, 1.5)).rounds(2 * budget) == expected
 
 
@@ -67,8 +70,8 @@ def test_a_design_that_is_lucky_on_the_seeds_of_the_search_does_not_win():
     point, loss, _ = made.study.best()
     assert loss == 0.0 and not np.array_equal(best.point, point)
     assert best.searched_loss > 0 and best.loss < 0.2 and best.fresh is not None
-    # the loss is that of the same design on these seeds
-    streams = range(FIRST_STREAM, FIRST_STREAM + len(best.losses))
+    # the loss is that of the same design on seeds that did not choose it
+    streams = range(CHECK_STREAM, CHECK_STREAM + len(best.losses))
     found = made.objective.evaluate(best.point[None], streams=streams)
     assert np.array_equal(found.losses[0], best.losses) and best.loss == found.losses[0].mean()
     low, high = best.band
@@ -125,7 +128,7 @@ def test_a_stopped_final_goes_on_where_it_was(tmp_path, monkeypatch):
 def test_a_seed_counts_with_the_worst_of_its_sizes():
     made = search(finals=Finals(sizes=(1.0, 2.0)))
     best = made.run(300, progress=False)
-    streams = range(FIRST_STREAM, FIRST_STREAM + len(best.losses))
+    streams = range(CHECK_STREAM, CHECK_STREAM + len(best.losses))
     both = [
         type(made.objective)(made.objective.task.resized(size)).evaluate(
             best.point[None], streams=streams
@@ -148,6 +151,38 @@ def test_a_search_stops_early_only_where_fresh_seeds_hold_the_loss():
     again = search(Lucky(most=0.6))
     again.run(2000, stop_at=1e-6, progress=False)
     assert again.study.colonies > 1900
+
+
+@dataclasses.dataclass(frozen=True)
+class Chance(Target):
+    """The loss is chance alone, between 0 and 1: of the design's level and the seed."""
+
+    names = ("gfp",)
+
+    def loss(self, state, history=None):
+        # of three digits, so that no last bit of a level counts
+        level = (1e3 * mean(state, "gfp").double()).round()
+        return (torch.sin(12.9898 * level + 78.233 * state.stream) * 43758.5453).remainder(1.0)
+
+
+def test_the_luck_of_the_finals_is_not_in_the_band():
+    """All designs are alike, with a mean loss of 0.5. The best of the finals seems better by its
+    seeds; on those of the check it does not."""
+    options = {"cells": 2, "method": Sobol(batch=16), "finals": Finals(share=0.5)}
+    found = []
+    for seed in range(40):
+        made = search(Chance(), seed=seed, **options)
+        best = made.run(90, progress=False)
+        chosen = [e.losses[k] for e in made.study.finals if e.streams[0] < CHECK_STREAM
+                  for k in np.flatnonzero((e.points == best.point).all(1))]  # fmt: skip
+        found.append(
+            (best.band[0] <= 0.5 <= best.band[1], best.loss, np.concatenate(chosen).mean())
+        )
+    inside, loss, by_choice = np.array(found, dtype=float).T
+    assert inside.sum() >= 31  # of 40 at 90 %, fewer by chance in 1 of 400
+    error = loss.std(ddof=1) / np.sqrt(len(loss))
+    assert abs(loss.mean() - 0.5) < 4 * error
+    assert by_choice.mean() < 0.5 - 2 * by_choice.std(ddof=1) / np.sqrt(len(loss))
 
 
 @pytest.mark.parametrize("reduce", ["worst", 0.75])

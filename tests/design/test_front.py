@@ -401,3 +401,32 @@ def test_what_makes_no_sense_is_refused(make, words):
 
 def test_spread_of_places_needs_no_species():
     assert Weighted([(Spread(), 1.0)]).names == ()
+
+
+def test_what_the_finals_had_no_room_for_is_told_and_at_hand():
+    made = search(finals=Finals(share=0.2, most=1))
+    front = made.run(120, progress=False)
+    whole = made.front(fresh=False)
+    assert front.seeds and not whole.seeds and len(whole) > len(front)
+    tested = {p.tobytes() for e in made.study.finals for p in e.points}
+    assert front.untested == sum(p.tobytes() not in tested for p in whole.points) > 0
+    said = f"{front.untested} more were not tested: search.front(fresh=False)"
+    assert said in front.table() and said in repr(front) and "not tested" not in repr(whole)
+
+
+def test_the_box_of_a_hypervolume_may_be_given():
+    made = search(finals=None)
+    front = made.run(32, progress=False)
+    every = np.concatenate([goals for _, goals in made.study.full_goals()])
+    good = every[nondominated(every)]
+    own = front.convergence()[1]
+    assert np.array_equal(front.convergence((good.min(0), good.max(0)))[1], own)
+    far = front.convergence(((0.0, 0.0), (100.0, 100.0)))[1]
+    area, before = 0.0, 100.0
+    for one, other in good[np.argsort(good[:, 0])]:
+        area += (100.0 - one) * (before - other)
+        before = other
+    assert far[-1] == pytest.approx(area / 1e4)
+    for box in (((0.0,), (1.0,)), ((1.0, 0.0), (1.0, 1.0)), (1.0, 2.0, 3.0)):
+        with pytest.raises(tf.InputError, match=r"convergence\(box\)"):
+            front.convergence(box)

@@ -3,9 +3,12 @@ say."""
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
-from searching import Level, lit
+import torch
+from searching import Level, lit, objective_of
 
 import torchfilm as tf
 from design import NSGA2, Burden, Constrained, OnFraction, Parameter, Search, Spread, Weighted
@@ -108,3 +111,33 @@ def test_a_constraint_beside_a_ready_target_is_no_failure():
     made = Search(lit, LIT, targets=goals, cells=3, replicates=2, method=NSGA2(population=8))
     made.run(40, progress=False)
     assert not made.study.failures()
+
+
+MIDDLES = np.array([[0.3, 0.6], [0.8, 0.2]])
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured(Burden):
+    """Measures the level once with its derivative, and once without, as profiles do."""
+
+    names = ("gfp",)
+
+    def measures(self, state, history=None):
+        level = self.loss(state)
+        return {"level": level, "shown": level.detach()}
+
+
+def test_constraints_without_derivatives_have_differences():
+    """Exact slopes of what is measured without tangents would be 0."""
+    options = {"cells": 8, "replicates": 2, "dtype": torch.float64}
+    target = Constrained(Burden(), [Measured()], at_least={"shown": 100.0})
+    objective = objective_of(lit, LIT, target, **options)
+    assert objective.why_differences == "constraints on shown have no derivatives"
+    found = objective.evaluate(MIDDLES, slopes=True).slopes.gradient
+    for k in range(2):
+        step = np.eye(2)[k] * 0.01
+        more, less = (objective.evaluate(MIDDLES + s).loss for s in (step, -step))
+        assert np.abs(more - less).min() > 0
+        assert found[:, k] == pytest.approx((more - less) / 0.02, rel=1e-6)
+    other = Constrained(Burden(), [Measured()], at_least={"level": 100.0})
+    assert objective_of(lit, LIT, other, **options).why_differences == ""

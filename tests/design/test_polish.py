@@ -152,7 +152,7 @@ def test_there_is_no_slope_among_levels_alone(method):
 
 def test_auto_descends_where_the_loss_is_a_sum_of_squares():
     chosen = choose(5, 500, 0, squares=True)
-    assert isinstance(chosen.method, Polish) and "slope" in chosen.why
+    assert isinstance(chosen.method, Polish) and "gradients" in chosen.why
     assert isinstance(choose(5, 500, 0).method, Racing)  # without slopes
     # too few designs for descents that come to an end
     assert isinstance(choose(30, 300, 0, squares=True).method, Racing)
@@ -250,7 +250,7 @@ def test_a_search_polishes_and_resumes(tmp_path):
     make = lambda: Search(lit, TWO, EDGES, cells=8, replicates=2, finals=None)
     whole = make()
     best = whole.run(colonies=160, progress=False)
-    assert whole.why_chosen.startswith("auto: polish") and "slope" in best.table()
+    assert whole.why_chosen.startswith("auto: polish") and "gradients" in best.table()
     assert any(e.slopes is not None for e in whole.study.entries)
     first = make()
     first.run(colonies=136, study=tmp_path / "a.h5", progress=False)

@@ -3,6 +3,7 @@ results as if it had never stopped."""
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import json
 import shutil
@@ -13,7 +14,7 @@ import pytest
 from searching import Level, Spread, fragile, grown, lit, paced
 
 import torchfilm as tf
-from design import CMAES, Batch, Choice, Parameter, Racing, Search, Sobol, Study
+from design import CMAES, Batch, Choice, Finals, Parameter, Racing, Search, Sobol, Study
 from design.entries import Entry
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
@@ -403,3 +404,42 @@ def test_info_says_what_was_searched_and_found():
     failed = sum(len(e.reasons) for e in made.study.entries)
     assert f"failed      {failed} colonies" in text
     assert f"best loss   {made.study.best()[1]:.4f} in the search" in text
+
+
+def test_the_history_is_a_table(tmp_path):
+    """A row for each design that was grown, as the study has it, and the same from a CSV file."""
+    made = search(METHODS["racing"](), finals=Finals(share=0.4))
+    made.run(60, progress=False)
+    found = made.study.history(tmp_path / "history.csv")
+    every = [*made.study.entries, *made.study.finals]
+    count = sum(len(e.points) for e in every)
+    assert {len(x) for x in found.values()} == {count}
+    assert found["loss"] == [x for e in every for x in e.loss.tolist()]
+    assert sum(found["colonies"]) == pytest.approx(made.study.colonies)
+    assert found["make"] == [v["make"] for e in every for v in e.values]
+    assert sum(found["finals"]) == sum(len(e.points) for e in made.study.finals)
+    small = found["size"].index(0.5)
+    assert np.isnan(found["loss_1"][small]) == (found["replicates"][small] == 1)
+    with open(tmp_path / "history.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(r["loss"]) for r in rows] == found["loss"] and len(rows) == count
+    with pytest.raises(tf.InputError, match="It is there already"):
+        made.study.history(tmp_path / "history.csv")
+
+
+def test_a_method_may_draw_by_a_seed_of_its_own(tmp_path):
+    """The colonies are the same: a design has the same loss whatever its method's seed."""
+    first, second = (search(method_seed=k) for k in (0, 1))
+    for made in (first, second):
+        made.run(12, progress=False)
+    one, other = (made.study.entries[0] for made in (first, second))
+    assert not np.array_equal(one.points, other.points)
+    assert np.array_equal(second.objective.evaluate(one.points).loss, one.loss)
+    plain = search()
+    plain.run(12, progress=False)
+    assert np.array_equal(plain.study.entries[0].points, one.points)
+    first.run(12, study=tmp_path / "s.h5", progress=False)
+    with pytest.raises(tf.InputError, match="method seed"):
+        second.run(12, study=tmp_path / "s.h5", progress=False)
+    with pytest.raises(tf.InputError, match="method_seed = -1"):
+        search(method_seed=-1)

@@ -1,0 +1,66 @@
+"""The history of a search as a table: a row for each design of each batch, in the order in which
+they were grown."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from design.entries import Entry
+from torchfilm import checks
+
+
+def history_of(
+    names: Sequence[str], entries: Sequence[Entry], finals: Sequence[Entry]
+) -> dict[str, list[Any]]:
+    """Columns by name; see `Study.history`."""
+    every = [*entries, *finals]
+    rows = [*_rows(names, entries, False), *_rows(names, finals, True)]
+    replicates = max((e.replicates for e in every), default=0)
+    count = max((e.goals.shape[1] for e in every if e.goals is not None), default=0)
+    goals = [f"goal_{k}" for k in range(count)]
+    columns = [
+        "batch", "finals", "size", "replicates", "first_seed", "colonies", "loss", "failed",
+        "reason", "cells", *names, *goals, *(f"loss_{k}" for k in range(replicates)),
+    ]  # fmt: skip
+    return {name: [row.get(name, np.nan) for row in rows] for name in columns}
+
+
+def _rows(names: Sequence[str], entries: Sequence[Entry], finals: bool) -> Iterator[dict[str, Any]]:
+    for batch, entry in enumerate(entries):
+        for k, values in enumerate(entry.values):
+            reasons = [why for (row, _), why in entry.reasons.items() if row == k]
+            row = {
+                "batch": batch,
+                "finals": finals,
+                "size": entry.size,
+                "replicates": entry.replicates,
+                "first_seed": entry.streams[0],
+                "colonies": entry.colonies / len(entry.points),
+                "loss": float(entry.loss[k]),
+                "failed": len(reasons),
+                "reason": reasons[0] if reasons else "",
+                "cells": float(entry.cells[k].mean()),
+                **{name: values[name] for name in names},
+                **{f"loss_{r}": float(x) for r, x in enumerate(entry.losses[k])},
+            }
+            if entry.goals is not None:
+                row |= {f"goal_{g}": float(x) for g, x in enumerate(entry.goals[k])}
+            yield row
+
+
+def write_csv(path: str | Path, columns: dict[str, list[Any]]) -> None:
+    """Write columns as a CSV file. Raises InputError for a file that is there already."""
+    path = checks.file_path("history", path)
+    if path.exists():
+        raise checks.input_error("history", str(path), "a new file", "It is there already.")
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    path.write_text(text.getvalue(), encoding="utf-8", newline="")
