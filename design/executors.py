@@ -69,6 +69,10 @@ def run_work_items(
 def check_executor(executor: Executor) -> None:
     """Raises InputError for a pool of processes that would hang: one that forks, and one in a
     script without a guard, which every worker would run from its beginning."""
+    if not callable(getattr(executor, "submit", None)):
+        raise checks.input_error(
+            "executor", executor, "an executor, such as ProcessPoolExecutor(4), or None"
+        )
     if not isinstance(executor, ProcessPoolExecutor):
         return
     # the pool has no public name for it; without one, its workers are not checked

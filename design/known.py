@@ -104,9 +104,11 @@ def _point(design: Any, task: Task) -> np.ndarray:
                     checks.suggestion(name, allowed),
                 )
     space = task.space
-    return space.point(
-        {name: values[name] if name in values else _usual(task, name) for name in space.names}
-    )
+    given = {n: values[n] if n in values else _usual(task, n) for n in space.names}
+    try:
+        return space.point(given)
+    except checks.InputError as error:
+        raise checks.InputError(f"start: {error} Widen its bounds, or leave it out.") from error
 
 
 def _usual(task: Task, name: str) -> Value:

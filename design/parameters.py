@@ -140,13 +140,17 @@ class Choice(metaclass=checks.KnownKeywords):
         resolve: Resolve | None = None,
     ):
         _check_name("Choice", name)
+        if isinstance(options, np.ndarray):
+            options = options.tolist()
         listed = isinstance(options, Sequence) and not isinstance(options, str)
+        if listed:  # numbers of numpy are numbers
+            options = tuple(o.item() if isinstance(o, np.generic) else o for o in options)
         odd = [o for o in options if not isinstance(o, (str, bool, int, float))] if listed else []
         if odd:
             raise checks.input_error(
-                f"Choice({name!r}).options",
+                f"one of Choice({name!r}).options",
                 odd[0],
-                "texts, numbers, True or False",
+                "a text, a number, True or False",
                 "Give a name, and let the scene function look the object up.",
             )
         # 1 and True are equal, so that their values could not be distinguished

@@ -52,14 +52,14 @@ def main() -> None:
         flush=True,
     )
     cluster = options.scheduler or LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None
+        n_workers=2, threads_per_worker=1, dashboard_address=":0"
     )
     with Client(cluster) as client:
         executor = client.get_executor(pure=False)
         objective.evaluate(
-            points[:2], executor=executor, pieces=2
+            points[:2], executor=executor, work_items=2
         )  # each worker imports torch once
-        undisturbed = objective.evaluate(points, executor=executor, pieces=options.pieces)
+        undisturbed = objective.evaluate(points, executor=executor, work_items=options.work_items)
         print(
             f"{len(client.run(os.getpid))} workers: {undisturbed.seconds:.1f} s, identical:"
             f" {np.array_equal(undisturbed.losses, here.losses)}",
@@ -71,7 +71,7 @@ def main() -> None:
             lambda: client.run(kill, pid, workers=[address], on_error="ignore"),
         )
         killer.start()
-        disturbed = objective.evaluate(points, executor=executor, pieces=options.pieces)
+        disturbed = objective.evaluate(points, executor=executor, work_items=options.work_items)
         print(
             f"worker {pid} killed after {0.5 * undisturbed.seconds:.1f} s"
             f" of {disturbed.seconds:.1f} s;"

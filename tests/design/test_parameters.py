@@ -122,7 +122,10 @@ def test_a_space_has_one_dimension_for_each_parameter():
         (lambda: Choice("c", (1, True)), "at least two different"),
         (lambda: Choice("c", "ab"), "at least two different"),
         (lambda: Choice("c", None), "at least two different"),
-        (lambda: Choice("c", ([1], [2])), r"options = \[1\].*texts, numbers"),
+        (
+            lambda: Choice("c", ([1], [2])),
+            r"one of Choice\('c'\).options = \[1\].*a text, a number",
+        ),
         (lambda: Choice("", ("a", "b")), "Choice.name = ''"),
         (lambda: Space([]), r"parameters = \[\].*at least one"),
         (lambda: Space(Parameter("k", 0, 1)), "a list of Parameter"),
@@ -152,3 +155,17 @@ def test_a_space_has_one_dimension_for_each_parameter():
 def test_bad_input_is_refused(make, words):
     with pytest.raises(tf.InputError, match=words):
         make()
+
+
+def test_options_of_numpy_are_numbers():
+    for numbers in (np.array([1, 2]), (np.int64(1), np.int64(2))):
+        options = Choice("a", numbers).options
+        assert options == (1, 2) and all(type(x) is int for x in options)
+
+
+def test_a_point_beyond_the_space_has_no_values():
+    space = Space([Parameter("a", 1, 3, whole=True), Parameter("b", 0.1, 1.0)])
+    assert space.values(np.array([1.0, 1.0 + 1e-12])) == {"a": 3, "b": 1.0}
+    for point in ([-1.0, 0.5], [0.5, 2.0], [0.5, math.nan]):
+        with pytest.raises(tf.InputError, match=r"point = .* 2 coordinates in \[0, 1\]"):
+            space.values(np.array(point))

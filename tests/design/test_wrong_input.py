@@ -187,6 +187,15 @@ def test_a_stripe_beyond_the_colonies_is_refused_again_where_the_search_is_resum
         assert len(found.study.entries) == 1, "nothing more is grown"
 
 
+def test_what_is_no_executor_no_type_or_no_start_is_named():
+    with pytest.raises(tf.InputError, match=r"executor = 4 .* ProcessPoolExecutor\(4\)"):
+        search(cells=8, replicates=2).run(colonies=20, executor=4, progress=False)
+    with pytest.raises(tf.InputError, match=r"^dtype = 'float64' .* torch.float64\.$"):
+        search(cells=8, dtype="float64")
+    with pytest.raises(tf.InputError, match=r"^start: make = 1000.0 .* Widen its bounds"):
+        search(cells=8, start={"make": 1000.0, "decay": 1.0})
+
+
 def test_warnings_of_a_scene_name_the_users_line():
     def unread(make=1.0, decay=1.0):
         circuit = tf.Circuit(lambda u, s, p, cell: {"gfp": p.make}, species="gfp", make=make,
