@@ -17,6 +17,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from design.objective import Objective
+from design.parameters import Choice
 from design.pareto import nondominated, spread
 from design.study import Study
 from design.task import Task
@@ -93,12 +94,13 @@ class Finals(metaclass=checks.KnownKeywords):
 @dataclass(frozen=True, eq=False)
 class FreshLosses:
     """A design on fresh seeds: losses (S,) of each, the worst of its sizes; loss: what they reduce
-    to; band: where that lies with a probability of 90 %, unless the design was chosen by these
-    losses."""
+    to; band: where that lies with a probability of 90 %, unless the design was `chosen` among
+    others by these losses."""
 
     losses: np.ndarray
     loss: float
     band: tuple[float, float]
+    chosen: bool = False
 
 
 def fresh_losses(
@@ -117,7 +119,9 @@ def _fresh(
     losses = worst_of_sizes([_tested(study, point, size, first=first) for size in sizes])
     if len(losses) < LEAST:
         return None
-    return FreshLosses(losses, float(task.reduced(losses[None])[0]), _band(task, losses))
+    rivals = {p.tobytes() for e in study.finals for p in e.points}
+    chosen = first == FIRST_STREAM and len(rivals) > 1
+    return FreshLosses(losses, float(task.reduced(losses[None])[0]), _band(task, losses), chosen)
 
 
 def fresh_goals(
@@ -219,13 +223,16 @@ class FinalsRun:
         if self.task.goals:
             self._front()
             return
-        chosen = self._finalists()
+        chosen, wanted = self._finalists(), self.finals.check_seeds(self.budget)
         for count, seeds in self.finals.rounds(self.budget):
-            chosen = self._grow(chosen[:count], seeds)
+            chosen = self._grow(chosen[:count], seeds, kept=wanted * sum(self.finals.sizes))
             chosen = sorted(chosen, key=partial(self._loss, seeds))
         best = winner(self.task, self.study, self.finals.sizes)
-        if best is not None and (seeds := self.finals.check_seeds(self.budget)):
-            self._grow([best], seeds, CHECK_STREAM)
+        if best is not None and wanted:
+            # an earlier run with a smaller budget has spent a part on other designs
+            while wanted > LEAST and not self._affords(self._cost(best, wanted, CHECK_STREAM)):
+                wanted -= 1
+            self._grow([best], wanted, CHECK_STREAM)
 
     def holds(self, wanted: float) -> bool:
         """Whether one of the best designs, of all and of the last batch, holds a loss on fresh
@@ -269,12 +276,16 @@ class FinalsRun:
         full = self.study.full()
         rows = [(float(e.loss[k]), e.points[k]) for e in full for k in range(len(e.loss))]
         space = self.task.space
+        # options of a choice are as different as can be, however many there are
+        apart = [
+            min(ALIKE, 0.5 / p.levels) if isinstance(p, Choice) else ALIKE for p in space.parameters
+        ]
         out: list[np.ndarray] = []
         places: list[np.ndarray] = []
         for _, point in sorted(rows, key=lambda row: row[0]):
             # several points may stand for one design: that of its values
             place = space.point(space.values(point))
-            if all(np.abs(place - other).max() >= ALIKE for other in places):
+            if all((np.abs(place - other) >= apart).any() for other in places):
                 out.append(point)
                 places.append(place)
                 if len(out) == self.finals.most:
@@ -282,15 +293,16 @@ class FinalsRun:
         return out
 
     def _grow(
-        self, points: Sequence[np.ndarray], seeds: int, first: int = FIRST_STREAM
+        self, points: Sequence[np.ndarray], seeds: int, first: int = FIRST_STREAM, kept: float = 0.0
     ) -> list[np.ndarray]:
         """Grow designs on as many of the fresh seeds from `first` on as they lack, the best first,
-        while the budget lasts. Returns those that have been grown on all."""
+        while the budget lasts, less the colonies that are `kept`. Returns those that have been
+        grown on all."""
         lacking: dict[tuple[float, int], list[np.ndarray]] = {}
         done, spent = [], 0.0
         for point in points:
             cost = self._cost(point, seeds, first)
-            if not self._affords(spent + cost):
+            if cost and not self._affords(spent + cost + kept):
                 break
             spent += cost
             done.append(point)

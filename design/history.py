@@ -14,6 +14,12 @@ import numpy as np
 from design.entries import Entry
 from torchfilm import checks
 
+OWN = (
+    "batch", "finals", "size", "replicates", "first_seed", "colonies", "loss", "failed", "reason",
+    "cells",
+)  # fmt: skip
+NUMBERED = ("loss_", "goal_")
+
 
 def history_of(
     names: Sequence[str], entries: Sequence[Entry], finals: Sequence[Entry]
@@ -24,11 +30,14 @@ def history_of(
     replicates = max((e.replicates for e in every), default=0)
     count = max((e.goals.shape[1] for e in every if e.goals is not None), default=0)
     goals = [f"goal_{k}" for k in range(count)]
-    columns = [
-        "batch", "finals", "size", "replicates", "first_seed", "colonies", "loss", "failed",
-        "reason", "cells", *names, *goals, *(f"loss_{k}" for k in range(replicates)),
-    ]  # fmt: skip
+    named = _column_names(names)
+    columns = [*OWN, *named.values(), *goals, *(f"loss_{k}" for k in range(replicates))]
     return {name: [row.get(name, np.nan) for row in rows] for name in columns}
+
+
+def _column_names(names: Sequence[str]) -> dict[str, str]:
+    """The column of each parameter: its name, or where that is a column already, another."""
+    return {n: f"parameter {n}" if n in OWN or n.startswith(NUMBERED) else n for n in names}
 
 
 def _rows(names: Sequence[str], entries: Sequence[Entry], finals: bool) -> Iterator[dict[str, Any]]:
@@ -46,7 +55,7 @@ def _rows(names: Sequence[str], entries: Sequence[Entry], finals: bool) -> Itera
                 "failed": len(reasons),
                 "reason": reasons[0] if reasons else "",
                 "cells": float(entry.cells[k].mean()),
-                **{name: values[name] for name in names},
+                **{column: values[name] for name, column in _column_names(names).items()},
                 **{f"loss_{r}": float(x) for r, x in enumerate(entry.losses[k])},
             }
             if entry.goals is not None:

@@ -145,7 +145,8 @@ def _seeds(task: Task, fresh: FreshLosses) -> str:
         others = show_loss(float(fresh.losses[~failed].mean())) if not failed.all() else "none"
         return f"{failed.sum()} of {seeds} seeds failed; the mean of the others: {others}"
     low, high = fresh.band
-    return f"{show_loss(low)} … {show_loss(high)}, {seeds} seeds"
+    by = ", which chose it" if fresh.chosen else ""
+    return f"{show_loss(low)} … {show_loss(high)}, {seeds} seeds{by}"
 
 
 def _loss_title(report: SearchReport) -> str:

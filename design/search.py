@@ -3,6 +3,7 @@ until the budget is used. Then the best designs are tested on fresh seeds."""
 
 from __future__ import annotations
 
+import math
 import sys
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -55,17 +56,17 @@ class Search(TaskOptions):
         )
         best = search.run(colonies=2000, study="stripe.h5")
 
-    method: "cmaes", "sobol", "racing", "bayesian", "local", for several goals "nsga2", one of their
-    objects with settings of its own, or any object with start, ask and tell (`Method`); "auto"
-    chooses, and `best.table()` says why. finals: how the best designs are tested on fresh seeds;
-    None leaves this out. start: designs from which the search starts: their values by name, a
-    `Best`, the file of a saved design, or a `Study` or its file. A study of the same task with
-    other bounds, or without some of the parameters, keeps its losses; of any other designs the best
-    are grown again; `run` prints which are left out, and why. method_seed: of what the method
-    draws, by default `seed`, which the colonies have; to compare methods on the same colonies.
-    `TaskOptions` documents the other
-    arguments; `search.objective.task` holds them checked. Raises the errors of `Task`, and
-    InputError for a method, finals or a start that are not allowed.
+    method: "cmaes", "sobol", "racing", "bayesian", "local", "polish", "exhaustive", for several
+    goals "nsga2", one of their objects with settings of its own, or any object with start, ask and
+    tell (`Method`); "auto" chooses, and `best.table()` says why. finals: how the best designs are
+    tested on fresh seeds; None leaves this out. start: designs from which the search starts: their
+    values by name, a `Best`, the file of a saved design, or a `Study` or its file. A study of the
+    same task with other bounds, or without some of the parameters, keeps its losses; of any other
+    designs the best are grown again; `run` prints which are left out, and why. method_seed: of what
+    the method draws, by default `seed`, which the colonies have; to compare methods on the same
+    colonies.
+    `TaskOptions` documents the other arguments; `search.objective.task` holds them checked. Raises
+    the errors of `Task`, and InputError for a method, finals or a start that are not allowed.
     """
 
     method: str | Method = field(default="auto", kw_only=True)
@@ -81,7 +82,8 @@ class Search(TaskOptions):
         if not isinstance(self.finals, Finals | None):
             raise checks.input_error("finals", self.finals, "Finals(…) or None")
         if self.method_seed is not None:
-            checks.integer("method_seed", self.method_seed, least=0)
+            seed = checks.integer("method_seed", self.method_seed, least=0)
+            object.__setattr__(self, "method_seed", seed)
         known = None if self.start is None else known_designs(self.start, task)
         chosen = _check_method(self.method, task)
         for name, value in (
@@ -335,7 +337,9 @@ class Search(TaskOptions):
             task.tried.stochastic,
             task.replicates,
             before,
-            designs_of(task.space),
+            # where choices are resolved, several designs are one
+            math.inf if task.space.digest else designs_of(task.space),
+            (colonies - (self.finals.colonies(colonies) if self.finals else 0.0)) / task.replicates,
         )
 
     def _open_study(self, path: str | Path | None, method: str) -> Study:

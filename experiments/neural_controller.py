@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -234,7 +235,7 @@ def draw(rows: dict[str, list[tf.State]], path: Path) -> None:
     """One new colony at three times, of each answer; dashed: where the band should be."""
     from matplotlib.figure import Figure
 
-    from torchfilm.pictures.draw import draw_cells, scale_bar
+    from torchfilm.pictures.draw import colour_bar, draw_cells, scale_bar
 
     shown = (0, 2, len(HOURS) - 1)
     figure = Figure(figsize=(9.0, 3.0 * len(rows)), layout="constrained")
@@ -248,10 +249,12 @@ def draw(rows: dict[str, list[tf.State]], path: Path) -> None:
                 for n in ("position", "axis", "length", "radius", "gfp")
             }
             limits, window = {"gfp": (0.0, brightest)}, (-22.0, 22.0, -22.0, 22.0)
-            draw_cells(ax, cells, colour="gfp", limits=limits, window=window)
+            scales = draw_cells(ax, cells, colour="gfp", limits=limits, window=window)
             BAND.draw(ax, one, 0)
             loss = float(BAND.loss(one))
             ax.set_title(f"{name}, {HOURS[k]:g} h: loss {loss:.2f}", fontsize=9)
+        # the scale of a row, within its last panel
+        colour_bar(line[-1].inset_axes((0.62, 0.06, 0.33, 0.04)), replace(scales[0], unit="conc"))
     scale_bar(axes[-1, 0])
     figure.savefig(path, dpi=110)
 

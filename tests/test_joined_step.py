@@ -51,7 +51,7 @@ def test_joined_steps_have_the_bits_of_single_ones(dim, law, contacts, dtype):
     rate = tf.LogNormal(3.0 if law == "linear" else 1.0, 0.1)  # µm/h, 1/h
     scene = scene_of(dim, law, CONTACTS[contacts], rate)
     model = scene.bind(3, seed=1, dtype=dtype)
-    assert any(isinstance(part, JoinedStep) for part in model._parts)
+    assert any(isinstance(part, JoinedStep) for part in model._joined_parts)
     joined = single = model.start()
     for _ in range(70):
         joined, single = model.step(joined), one_by_one(model, single, model.dt)
@@ -100,9 +100,9 @@ def test_growth_past_all_numbers_is_reported_as_by_single_steps():
 def test_rates_by_type_and_effects_in_between_are_not_joined():
     by_type = tf.Growth(rate={0: 0.6, 1: 1.2})
     model = tf.Scene(by_type, tf.Mechanics(dim=2)).bind()
-    assert not any(isinstance(part, JoinedStep) for part in model._parts)
+    assert not any(isinstance(part, JoinedStep) for part in model._joined_parts)
     by_torch = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, backend="torch")).bind()
-    assert not any(isinstance(part, JoinedStep) for part in by_torch._parts)
+    assert not any(isinstance(part, JoinedStep) for part in by_torch._joined_parts)
 
 
 def test_time_is_told_of_each_effect():
@@ -144,6 +144,6 @@ def test_a_step_of_ones_own_contacts_is_taken():
             return (Still(self, binding),)
 
     model = tf.Scene(tf.Growth(rate=1.0), Own(dim=2)).bind()
-    assert not any(isinstance(part, JoinedStep) for part in model._parts)
+    assert not any(isinstance(part, JoinedStep) for part in model._joined_parts)
     state = model.start()
     assert torch.equal(model.step(state).position, state.position + 1.0)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchfilm.state import Field, State
 from torchfilm.tools import checks, displays
+from torchfilm.tools.parts import mapped
 from torchfilm.tools.tangents import has_tangent
 from torchfilm.values import ByType, Distribution, PerColony, is_drawn, is_inherited
 
@@ -301,29 +302,14 @@ def check_length(name: str, given: Tensor, batch: BoundBatch) -> None:
 def snapshot(part: Any, path: str, batch: BoundBatch) -> Any:
     """A wall, signal or other part of an effect with its tensors copied to the batch's device,
     their lengths checked."""
-    if isinstance(part, Tensor):
-        check_length(path, part, batch)
-        return part.to(device=batch.device, copy=True)
-    if isinstance(part, (tuple, list)):
-        made = [snapshot(item, f"{path}[{k}]", batch) for k, item in enumerate(part)]
-        same = all(a is b for a, b in zip(made, part, strict=True))
-        return part if same else type(part)(made)
-    if isinstance(part, Mapping):
-        each = {name: snapshot(item, f"{path}[{name!r}]", batch) for name, item in part.items()}
-        return part if all(each[name] is part[name] for name in each) else each
-    if dataclasses.is_dataclass(part) and not isinstance(part, type):
-        changed = {
-            f.name: snapshot(getattr(part, f.name), f"{path}.{f.name}", batch)
-            for f in dataclasses.fields(part)
-        }
-        if all(changed[n] is getattr(part, n) for n in changed):
-            return part
-        copy = object.__new__(type(part))
-        copy.__dict__.update(
-            {**vars(part), **changed}
-        )  # past __init__: the values have been checked
-        return copy
-    return part
+
+    def copied(path: str, x: Any) -> Any:
+        if not isinstance(x, Tensor):
+            return x
+        check_length(path, x, batch)
+        return x.to(device=batch.device, copy=True)
+
+    return mapped(part, copied, path)
 
 
 def drawn_field(title: str, name: str, value: Any) -> Field:

@@ -19,8 +19,6 @@ BATCH, WIDTH = 24, 0.5
 # designs before the first descents (less than one race, whose end they await), and for each
 # parameter of a descent, so that it ends
 BEFORE, EACH, MOST_STARTS = 5, 10, 3
-# of the designs that a budget can grow, those that are left for the search
-GROWN = 0.8
 # designs of a batch of a race where every design needs many replicates
 FEW = 12
 # designs of a batch of a model, and at most in a search, since its time grows as the cube of all
@@ -57,13 +55,15 @@ def choose(
     replicates: int = 4,
     before: str = "",
     different: float = math.inf,
+    searched: float = 0.0,
 ) -> Chosen:
     """The method of a search that leaves the choice. dimensions: parameters; designs: that the
     budget can grow with all replicates; goals: 0 for one target; pattern: whether the target is a
     pattern, of which small colonies show something; squares: whether its loss is a sum of squares
     with exact derivatives; chance: whether molecules are counted one by one; replicates: of a
     design; before: what the study of a search that is resumed says of its method, which goes
-    on; different: designs in the space."""
+    on; different: designs in the space; searched: those that the budget grows
+    before the finals."""
     botorch, cloud = find_spec("botorch") is not None, CMAES(population=BATCH, sigma=WIDTH)
     alone = chance or not pattern  # the model draws all designs
     most, least = MODELLED if alone else RACED, LEAST_RACED if pattern else 0
@@ -107,7 +107,7 @@ def choose(
             return Chosen(chosen.method, "the study began with it")
     if goals:
         return Chosen(NSGA2(), f"{goals} goals side by side")
-    if different <= GROWN * designs:
+    if different <= searched:
         return every
     if designs < least:
         return few

@@ -15,9 +15,11 @@ MOST = 100_000  # designs
 
 @dataclass(kw_only=True, eq=False)
 class Exhaustive(AskTell):
-    """Every design of a space once: for choices and whole numbers alone. The search then ends.
+    """Every design of a space once: for choices and whole numbers alone. The search then ends, and
+    its finals take all that is left of the budget, whatever their share.
 
-    batch: designs in a batch. Raises InputError for a parameter without levels.
+    batch: designs in a batch. Choices that exclude each other (`resolve`) make some designs twice.
+    Raises InputError for a parameter without levels.
     """
 
     batch: int = 64
@@ -59,4 +61,4 @@ class Exhaustive(AskTell):
 
 def designs_of(space: Dimensions) -> float:
     """How many designs a space has; infinity where a parameter has no levels."""
-    return math.prod(math.inf if n is None else n for n in space.levels)
+    return math.prod(math.inf if n is None else float(n) for n in space.levels)

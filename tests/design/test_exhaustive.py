@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from asking import Room
@@ -10,6 +12,7 @@ from searching import Level, lit
 import torchfilm as tf
 from design import Choice, Exhaustive, Finals, Parameter, Search
 from design.finals import CHECK_STREAM
+from design.methods import designs_of
 
 FEW = [Parameter("make", 1, 3, whole=True), Choice("decay", (0.5, 1.0))]
 
@@ -47,8 +50,28 @@ def test_a_budget_that_grows_every_design_grows_each_once():
     assert best.searched_loss <= np.sort(whole.loss)[1]
 
 
+def test_all_options_of_a_long_choice_may_come_to_the_finals():
+    options = tuple(0.3 + 0.01 * k for k in range(100))
+    made = search([Choice("make", options, per_colony=True)], replicates=1, cells=3)
+    made.run(400, progress=False)
+    entries = made.study.entries
+    order = np.argsort(np.concatenate([e.loss for e in entries]), kind="stable")
+    points = np.concatenate([e.points for e in entries])
+    first = next(e for e in made.study.finals)
+    assert sorted(first.points.ravel()) == sorted(points[order[:8]].ravel())
+
+
+def test_a_budget_whose_finals_leave_too_little_searches_as_elsewhere():
+    assert "exhaustive" not in search(finals=Finals(share=0.6)).run(22, progress=False).table()
+    assert "exhaustive" in search(finals=Finals(share=0.5)).run(24, progress=False).table()
+
+
+def test_many_dimensions_have_no_end_of_designs():
+    assert designs_of(Room((10,) * 400)) == math.inf
+
+
 def test_a_smaller_budget_searches_as_elsewhere():
-    best = search().run(14, progress=False)  # six designs of two, and finals
+    best = search().run(11, progress=False)  # six designs of two take one more
     assert "exhaustive" not in best.table()
     more = [*FEW[:1], Parameter("decay", 0.5, 1.0)]
     assert "exhaustive" not in search(more).run(60, progress=False).table()

@@ -185,6 +185,26 @@ def test_the_luck_of_the_finals_is_not_in_the_band():
     assert by_choice.mean() < 0.5 - 2 * by_choice.std(ddof=1) / np.sqrt(len(loss))
 
 
+def test_a_search_that_goes_on_checks_its_winner_again(tmp_path):
+    """The rounds leave room for the check, also where an earlier run has spent a part."""
+    for seed in range(6):
+        options = {"cells": 2, "method": Sobol(batch=16), "seed": seed}
+        path = tmp_path / f"{seed}.h5"
+        for budget in (100, 150, 200):
+            best = search(Chance(), **options).run(budget, study=path, progress=False)
+            assert not best.fresh.chosen and len(best.losses) >= LEAST
+            assert "which chose it" not in best.table()
+
+
+def test_a_band_by_which_a_design_was_chosen_is_told():
+    made = search(Chance(), cells=2, method=Sobol(batch=16))
+    best = made.run(100, progress=False)
+    made.study.finals[:] = [e for e in made.study.finals if e.streams[0] < CHECK_STREAM]
+    chosen = made.best()
+    assert chosen.fresh.chosen and "seeds, which chose it" in chosen.table()
+    assert np.array_equal(chosen.point, best.point) and not best.fresh.chosen
+
+
 @pytest.mark.parametrize("reduce", ["worst", 0.75])
 def test_bands_of_quantiles(reduce):
     best = search(reduce=reduce).run(400, progress=False)

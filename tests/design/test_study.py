@@ -427,6 +427,17 @@ def test_the_history_is_a_table(tmp_path):
         made.study.history(tmp_path / "history.csv")
 
 
+def test_parameters_keep_their_columns_in_a_history():
+    def sized(size, cells):
+        return lit(make=size, decay=cells)
+
+    made = search(scene=sized, parameters=[Parameter("size", 2, 3), Parameter("cells", 0.5, 1)])
+    made.run(6, progress=False)
+    found = made.study.history()
+    assert found["size"] == [1.0] * len(found["size"]) and min(found["cells"]) >= 3
+    assert min(found["parameter size"]) >= 2 and max(found["parameter cells"]) <= 1
+
+
 def test_a_method_may_draw_by_a_seed_of_its_own(tmp_path):
     """The colonies are the same: a design has the same loss whatever its method's seed."""
     first, second = (search(method_seed=k) for k in (0, 1))

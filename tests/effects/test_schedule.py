@@ -1,13 +1,16 @@
 """Media whose sources, faces, flow and reservoirs change at given times, and inputs of rates and
 rules that do."""
 
+import dataclasses
 import math
 import warnings
 
+import numpy as np
 import pytest
 import torch
 
 import torchfilm as tf
+from torchfilm.state import PER_CELL
 
 BOX = {"box": ((-32, -32), (32, 32)), "spacing": 4.0}
 F64 = {"dtype": torch.float64}
@@ -84,8 +87,8 @@ def test_a_schedule_is_a_run_in_pieces(where, backend):
 
 def assert_equal(found, expected):
     """Two states, to the bit."""
-    for name, value in expected.fields.items():
-        assert torch.equal(found.fields[name], value), name
+    for name in (*PER_CELL, *expected.fields):
+        assert torch.equal(getattr(found, name), getattr(expected, name)), name
 
 
 def leak(u, s, p, cell):
@@ -177,6 +180,59 @@ def test_rates_and_rules_take_its_value(backend):
         expected = 2 * on + (expected - 2 * on) * math.exp(-0.05)
         assert float(state.dye) == pytest.approx(expected, rel=1e-6)
         assert float(state.seen) == on
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_its_values_are_as_exact_as_the_time(backend):
+    slow = tf.Schedule({0: 0.1, 5: 0.3})
+
+    def rates(u, s, p, cell):
+        return {"dye": slow(cell.time)}
+
+    circuit = tf.Circuit(rates, species="dye", method="rk4", backend=backend)
+    end = runs(tf.Scene(circuit, dim=2), 0.4, **F64)
+    assert float(end.dye) == pytest.approx(0.04, rel=1e-14)
+    time = torch.tensor([4.0, 6.0], dtype=torch.float64)
+    assert slow(time).tolist() == [0.1, 0.3] and slow(np.float32(6.0)) == 0.3
+    with pytest.raises(tf.InputError, match="value of a Schedule in rates and rules"):
+        tf.Schedule({0: (1.0, 0.0)})(time)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Spot:
+    """A source that is a callable without a dictionary."""
+
+    rate: float
+
+    def __call__(self, positions):
+        return self.rate * (positions[:, 0].abs() < 8.0)
+
+
+def test_only_what_changes_is_prepared_again():
+    """Of two signals; and a source of any kind stays as it is."""
+    food = tf.Signal(diffusion=500.0, source=tf.Schedule({0: 1.0, 0.1: 2.0, 0.2: 3.0}))
+    still = tf.Signal(diffusion=50.0, source=Spot(1.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # nothing grows
+        scene = tf.Scene(tf.Growth(), tf.Mechanics(dim=2), tf.Medium(food=food, still=still, **BOX))
+    model = scene.bind()
+    state = model.start()
+    for _ in range(6):
+        state = model.step(state, 0.05)
+    (transport,) = {e.transport for e in model.effects if hasattr(e, "transport")}
+    (known,) = transport.carriers.values()
+    assert sorted(key[0] for key in known) == ["food"] * 3 + ["still"]
+
+
+def test_a_schedule_of_the_module_counts_for_a_study():
+    space = {}
+    code = "def lit(u, s, p, cell): return {'dye': light(cell.time)}"
+    exec(compile(code, "lit.py", "exec"), space)
+    found = []
+    for value in (1.0, 9.0):
+        space["light"] = tf.Schedule({0: value})
+        found.append(tf.digest(space["lit"]))
+    assert found[0] != found[1]
 
 
 def test_the_time_of_a_change_is_told():

@@ -34,6 +34,14 @@ if TYPE_CHECKING:
 
 # Methods that are exact over a step, whatever its length.
 EXACT = ("exponential", "series")
+MOST_KEPT = 128  # prepared steps of a grid
+
+
+def _keep(known: dict[Any, Any], key: Any, made: Any) -> None:
+    """Keep a prepared step, and no more than MOST_KEPT: schedules may have thousands of values."""
+    while len(known) >= MOST_KEPT:
+        known.pop(next(iter(known)))
+    known[key] = made
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +90,9 @@ class Transport:
             for n in signals
         }
         self._given = signals, flows, boundary
-        self.schedules = list(schedules(self._given))
+        self.schedules = schedules(self._given)
+        # those that transport of each signal depends on; a reservoir is none of it
+        self._moving = {n: schedules((x.source, flows[n], boundary[n])) for n, x in signals.items()}
         self._known: dict[tuple[int, ...], Constants] = {}
         # signals that take turns with circuits, in the medium's steps; that others move, by whom
         self.in_turns: frozenset[str] = frozenset()
@@ -161,7 +171,7 @@ class Transport:
         they stay."""
         assert state.layout is not None
         grid = state.layout.grid
-        key = (name, self.at(state.time).place, state.dtype, torch.is_grad_enabled())
+        key = (name, self._place(name, state), state.dtype, torch.is_grad_enabled())
         known = self._eaten.setdefault(grid, {})
         if key in known and not self._tracked(name, state):
             return known[key]
@@ -171,7 +181,7 @@ class Transport:
         ]
         # as of `carrier`: one that a gradient passes through serves one backward pass
         if not tracked(*(x for one in made for x in one.numbers())):
-            known[key] = made
+            _keep(known, key, made)
         return made
 
     def exchanges_per_hour(self, name: str, state: State) -> float:
@@ -188,7 +198,7 @@ class Transport:
     def carrier(self, name: str, state: State, batch: GridBatch, dt: float) -> Carrier:
         """The step of a signal on grids of one shape; it is reused while the grids stay."""
         assert state.layout is not None
-        place = self.at(state.time).place
+        place = self._place(name, state)
         if self._tracked(name, state):
             kept = {} if self._of_step is None else self._of_step
             own = (name, place, batch.shape, dt)
@@ -203,8 +213,12 @@ class Transport:
             # a function may use a tensor that requires a gradient; such a step serves one
             # backward pass only, so it is not kept
             if not differentiable:
-                known[key] = found
+                _keep(known, key, found)
         return found
+
+    def _place(self, name: str, state: State) -> tuple[int, ...]:
+        """Of the value that holds in each schedule by which a signal moves."""
+        return tuple(x.place(state.time) for x in self._moving[name])
 
     @contextmanager
     def one_step(self) -> Iterator[None]:

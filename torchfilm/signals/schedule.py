@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from typing import Any
 
 import torch
 
 from torchfilm.tools import checks
+from torchfilm.tools.parts import mapped
 
 # Hours, relative to the time: what times gather by rounding, far below any step.
 ROUNDING = 1e-9
@@ -26,8 +27,9 @@ class Schedule(metaclass=checks.KnownKeywords):
     take in place of the schedule. period: hours after which the values begin again; None: the last
     value stays.
 
-    A step takes the value that holds as it begins. In rates and rules, `schedule(cell.time)` is the
-    value at a time.
+    The medium takes the value that holds as a step begins. In rates and rules,
+    `schedule(cell.time)` is the value at a time: rates have that of the middle of a step, rules
+    that of its beginning.
     """
 
     values: Mapping[float, Any]
@@ -72,13 +74,18 @@ class Schedule(metaclass=checks.KnownKeywords):
 
     def __call__(self, time: Any) -> Any:
         """The value at a time, h, as rates and rules have it: a number, or a tensor."""
-        if isinstance(time, (int, float)):
-            return self.at(time)
+        if isinstance(time, Real):
+            return self.at(float(time))
+        for value in self.values.values():
+            if isinstance(value, (tuple, list)) or not hasattr(value, "__add__"):
+                raise checks.input_error(
+                    "value of a Schedule in rates and rules", value, "a number, or a column"
+                )
         after = time + ROUNDING
         after = after if self.period is None else after % self.period
-        found = self.values[0.0]
+        found = self.values[0.0] + 0.0 * time  # in the type of the time
         for start in self.times[1:]:
-            found = torch.where(after >= start, self.values[start], found)
+            found = torch.where(after >= start, self.values[start] + 0.0 * time, found)
         return found
 
     @property
@@ -103,32 +110,18 @@ def checked_values(name: str, given: Any, check: Callable[[str, Any], Any]) -> A
     return Schedule(values, given.period)
 
 
-def schedules(part: Any) -> Iterator[Schedule]:
+def schedules(part: Any) -> list[Schedule]:
     """All schedules in a part of a medium."""
-    if isinstance(part, Schedule):
-        yield part
-    elif isinstance(part, Mapping):
-        for item in part.values():
-            yield from schedules(item)
-    elif isinstance(part, (tuple, list)):
-        for item in part:
-            yield from schedules(item)
-    elif dataclasses.is_dataclass(part) and not isinstance(part, type):
-        for f in dataclasses.fields(part):
-            yield from schedules(getattr(part, f.name))
+    found: list[Schedule] = []
+
+    def seen(path: str, x: Any) -> Any:
+        found.extend([x] if isinstance(x, Schedule) else [])
+        return x
+
+    mapped(part, seen)
+    return found
 
 
 def at_time(part: Any, time: float) -> Any:
     """A part of a medium with the values of its schedules at a time, h."""
-    if isinstance(part, Schedule):
-        return part.at(time)
-    if isinstance(part, Mapping):
-        return {name: at_time(item, time) for name, item in part.items()}
-    if isinstance(part, (tuple, list)):
-        return type(part)(at_time(item, time) for item in part)
-    if dataclasses.is_dataclass(part) and not isinstance(part, type):
-        changed = {f.name: at_time(getattr(part, f.name), time) for f in dataclasses.fields(part)}
-        copy = object.__new__(type(part))
-        copy.__dict__.update({**vars(part), **changed})  # past __init__: they have been checked
-        return copy
-    return part
+    return mapped(part, lambda path, x: x.at(time) if isinstance(x, Schedule) else x)

@@ -115,7 +115,8 @@ def _parts(thing: Any) -> list[Any]:
 
 
 def _globals(function: FunctionType) -> list[Any]:
-    """The numbers, texts, arrays and functions of its own module that a function uses."""
+    """The numbers, texts, arrays, dataclasses and functions of its own module that a function
+    uses."""
     names: list[str] = []
     codes = [function.__code__]
     while codes:
@@ -130,6 +131,7 @@ def _globals(function: FunctionType) -> list[Any]:
         x
         for x in used
         if isinstance(x, plain)
+        or (dataclasses.is_dataclass(x) and not isinstance(x, type))
         or (isinstance(x, FunctionType) and x.__module__ == function.__module__)
     ]
 

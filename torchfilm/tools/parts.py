@@ -1,0 +1,33 @@
+"""Nested parts of a description: mappings, lists and dataclasses, changed leaf by leaf."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+
+def mapped(part: Any, change: Callable[[str, Any], Any], path: str = "") -> Any:
+    """A part with what `change` makes of what is in it, from (path, value); what it returns as it
+    was is looked into. Where nothing changes, the part itself."""
+    found = change(path, part)
+    if found is not part:
+        return found
+    if isinstance(part, (tuple, list)):
+        made = [mapped(item, change, f"{path}[{k}]") for k, item in enumerate(part)]
+        same = all(a is b for a, b in zip(made, part, strict=True))
+        return part if same else type(part)(made)
+    if isinstance(part, Mapping):
+        each = {name: mapped(item, change, f"{path}[{name!r}]") for name, item in part.items()}
+        return part if all(each[name] is part[name] for name in each) else each
+    if dataclasses.is_dataclass(part) and not isinstance(part, type):
+        changed = {
+            f.name: mapped(getattr(part, f.name), change, f"{path}.{f.name}")
+            for f in dataclasses.fields(part)
+        }
+        if all(changed[n] is getattr(part, n) for n in changed):
+            return part
+        copy = object.__new__(type(part))
+        copy.__dict__.update({**vars(part), **changed})  # past __init__: they have been checked
+        return copy
+    return part
