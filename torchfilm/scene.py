@@ -122,7 +122,8 @@ class Scene(metaclass=checks.KnownKeywords):
                 known = ("*effects", *CHANGEABLE)
                 raise checks.unknown_keyword("Scene.replace", name, known, NO_KEYWORD)
         kept: dict[str, Any] = {name: getattr(self, name) for name in CHANGEABLE}
-        if any(hasattr(e, "dim") for e in effects):  # they decide what was not given
+        if any(getattr(e, "dim", self.dim) != self.dim for e in effects):
+            # they decide what was not given
             kept |= self._given
         with once(self._said):  # what this scene has warned of, its copies need not
             return Scene(*(effects or self.effects), **{**kept, **changes})

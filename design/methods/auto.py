@@ -70,8 +70,7 @@ def choose(
     if botorch:
         least = _least_modelled(dimensions, replicates, alone)
     about = f"{(whole := math.floor(designs))} designs for {dimensions} parameters"
-    better = not botorch and designs <= most
-    hint = " (with botorch installed, a model of the loss would)" if better else ""
+    hint = "" if botorch or designs > most else " (with botorch, a model of the loss would)"
     few = Chosen(
         cloud,
         f"{whole} designs are fewer than {least}, too few to learn much from; its first batch is of"
@@ -102,9 +101,8 @@ def choose(
     descents = _descents(cloud, about)
     known = (few, race, *descents, *((learnt, modelled) if botorch else ()))
     every = Chosen(Exhaustive(), f"{different:g} different designs: the budget grows each")
-    for chosen in (*known, every) if before else ():
-        if chosen.describe() == before:
-            return Chosen(chosen.method, "the study began with it")
+    if begun := [x for x in (*known, every) if x.describe() == before]:
+        return Chosen(begun[0].method, "the study began with it")
     if goals:
         return Chosen(NSGA2(), f"{goals} goals side by side")
     if different <= searched:

@@ -237,7 +237,7 @@ def test_the_bar_shows_the_best_loss_and_the_failures(monkeypatch):
 
 def test_a_search_takes_the_arguments_of_a_task_and_a_method():
     task, search = (inspect.signature(kind).parameters for kind in (Task, Search))
-    assert set(search) == {*task, "method", "finals", "start"}
+    assert set(search) == {*task, "method", "finals", "start", "method_seed"}
     assert all(search[name] == parameter for name, parameter in task.items())
 
 
