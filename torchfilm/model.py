@@ -94,7 +94,9 @@ class Model:
     def step(self, state: State, dt: float | None = None, timings: Timings | None = None) -> State:
         """The state dt hours later (by default the scene's step): each effect in turn."""
         after_fork()
-        dt = self.dt if dt is None else checks.number("dt", dt, least=0.0)
+        dt = self.dt if dt is None else dt
+        if dt != self.dt:  # a check takes as long as a small effect
+            checks.number("dt", dt, least=0.0)
         state = self.opened(state)
         # torch's threads are set once a step, not once an effect
         alone = one_torch_thread() if self._by_kernels else nullcontext()

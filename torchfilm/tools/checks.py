@@ -209,10 +209,9 @@ def number(
     """Returns one finite number within bounds, or raises InputError."""
     if isinstance(value, bool) or not isinstance(value, Real):
         raise input_error(name, value, "a number", hint)
-    rule = _rule(above, least, most)
     found = float(value)
     if not (math.isfinite(found) and found > above and least <= found <= most):
-        raise input_error(name, value, rule, hint)
+        raise input_error(name, value, _rule(above, least, most), hint)
     return found
 
 
