@@ -1,7 +1,7 @@
 """Trains a small network that decides in each cell, to draw a band that stays 3 to 6 µm below the
 edge of a growing colony; then distils it to a circuit of Hill functions.
 
-    python experiments/neural_controller.py                  # 3 to 6 minutes on one core
+    python experiments/neural_controller.py                  # a quarter of an hour on one core
     python experiments/neural_controller.py --steps 20 --colonies 60 --out runs/neural
 
 Cells eat a food that comes from outside, so its level says how deep a cell lies. A network reads
