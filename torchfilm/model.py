@@ -94,10 +94,9 @@ class Model:
     def step(self, state: State, dt: float | None = None, timings: Timings | None = None) -> State:
         """The state dt hours later (by default the scene's step): each effect in turn."""
         after_fork()
-        dt = self.dt if dt is None else dt
-        if dt != self.dt:  # a check takes as long as a small effect
+        if dt not in (None, self.dt):  # a check takes as long as a small effect
             checks.number("dt", dt, least=0.0)
-        state = self.opened(state)
+        dt, state = self.dt if dt is None else dt, self.opened(state)
         # torch's threads are set once a step, not once an effect
         alone = one_torch_thread() if self._by_kernels else nullcontext()
         with alone, once(self._said) as self._said:
