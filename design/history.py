@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +26,11 @@ def history_of(
 ) -> dict[str, list[Any]]:
     """Columns by name; see `Study.history`."""
     every = [*entries, *finals]
-    rows = [*_rows(names, entries, False), *_rows(names, finals, True)]
+    named = _column_names(names)
+    rows = [*_rows(named, entries, False), *_rows(named, finals, True)]
     replicates = max((e.replicates for e in every), default=0)
     count = max((e.goals.shape[1] for e in every if e.goals is not None), default=0)
     goals = [f"goal_{k}" for k in range(count)]
-    named = _column_names(names)
     columns = [*OWN, *named.values(), *goals, *(f"loss_{k}" for k in range(replicates))]
     return {name: [row.get(name, np.nan) for row in rows] for name in columns}
 
@@ -40,7 +40,10 @@ def _column_names(names: Sequence[str]) -> dict[str, str]:
     return {n: f"parameter {n}" if n in OWN or n.startswith(NUMBERED) else n for n in names}
 
 
-def _rows(names: Sequence[str], entries: Sequence[Entry], finals: bool) -> Iterator[dict[str, Any]]:
+def _rows(
+    named: Mapping[str, str], entries: Sequence[Entry], finals: bool
+) -> Iterator[dict[str, Any]]:
+    """named: the column of each parameter."""
     for batch, entry in enumerate(entries):
         for k, values in enumerate(entry.values):
             reasons = [why for (row, _), why in entry.reasons.items() if row == k]
@@ -55,7 +58,7 @@ def _rows(names: Sequence[str], entries: Sequence[Entry], finals: bool) -> Itera
                 "failed": len(reasons),
                 "reason": reasons[0] if reasons else "",
                 "cells": float(entry.cells[k].mean()),
-                **{column: values[name] for name, column in _column_names(names).items()},
+                **{column: values[name] for name, column in named.items()},
                 **{f"loss_{r}": float(x) for r, x in enumerate(entry.losses[k])},
             }
             if entry.goals is not None:

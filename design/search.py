@@ -64,9 +64,9 @@ class Search(TaskOptions):
     same task with other bounds, or without some of the parameters, keeps its losses; of any other
     designs the best are grown again; `run` prints which are left out, and why. method_seed: of what
     the method draws, by default `seed`, which the colonies have; to compare methods on the same
-    colonies.
-    `TaskOptions` documents the other arguments; `search.objective.task` holds them checked. Raises
-    the errors of `Task`, and InputError for a method, finals or a start that are not allowed.
+    colonies. `TaskOptions` documents the other arguments; `search.objective.task` holds them
+    checked. Raises the errors of `Task`, and InputError for a method, finals or a start that are
+    not allowed.
     """
 
     method: str | Method = field(default="auto", kw_only=True)

@@ -110,8 +110,8 @@ class Study:
         size: share of the full size; replicates, and the first of their seeds; colonies: that it
         cost; loss, and that of each replicate, `loss_0` …, NaN beyond; goals, `goal_0` …; how many
         replicates failed, and why; cells, a mean; the parameters, those whose name is a column
-        already as "parameter NAME". A design that was grown with
-        derivatives has a row for these, too. path: of a new CSV file to write.
+        already as "parameter NAME". A design that was grown with derivatives has a row for these,
+        too. path: of a new CSV file to write.
         """
         found = history_of(self.names, self.entries, self.finals)
         if path is not None:

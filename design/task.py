@@ -98,8 +98,7 @@ class Task(TaskOptions):
             raise checks.input_error(
                 "replicates", self.replicates, "2 or more with Spread", "It compares seeds."
             )
-        if self.dtype not in (torch.float32, torch.float64):
-            raise checks.input_error("dtype", self.dtype, "torch.float32 or torch.float64")
+        checks.float_type("dtype", self.dtype)
         family.check_names()
         tried = try_scenes(
             family,

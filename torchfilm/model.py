@@ -363,8 +363,7 @@ def bind(
     founders = cells if cells is not None else scene.founders
     count = _count(scene, colonies, founders, only)
     seed = checks.integer("seed", seed, least=0, most=2**63 - 1)
-    if dtype not in (torch.float32, torch.float64):
-        raise checks.input_error("dtype", dtype, "torch.float32 or torch.float64")
+    checks.float_type("dtype", dtype)
     if founders.dim != scene.dim:
         raise checks.input_error("cells", f"{founders.dim}-D", f"{scene.dim}-D, as the scene is")
     batch = BoundBatch(count, dtype, checks.device(device), _types(founders), per_colony)

@@ -215,6 +215,12 @@ def number(
     return found
 
 
+def float_type(name: str, given: object) -> None:
+    """Raises InputError for what is no type of numbers that states may have."""
+    if given not in (torch.float32, torch.float64):
+        raise input_error(name, given, "torch.float32 or torch.float64")
+
+
 def value(
     name: str,
     given: object,
