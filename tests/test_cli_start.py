@@ -31,7 +31,9 @@ def test_start_from_a_label_image(command):
     mask[10:20, 5:35], mask[25:35, 20:50] = 1, 2
     np.save("masks.npy", np.stack([0 * mask + (mask == 1), mask]))
     run = ("run", "microcolony", "--until", 0.05, "--no-picture", "--start", "masks.npy")
-    with pytest.raises(SystemExit, match=r"--pixel-size = None.*given for masks.npy"):
+    with pytest.raises(
+        SystemExit, match=r"does not state the size of its pixels.*give --pixel-size"
+    ):
         command(*run)
     with pytest.raises(SystemExit, match=r"2 frames.*--frame"):
         command(*run, "--pixel-size", 0.1)

@@ -258,7 +258,7 @@ class Cells(metaclass=checks.KnownKeywords):
     def from_masks(
         image: Any,
         *,
-        pixel_size: float,
+        pixel_size: float | None = None,
         fluorescence: Mapping[str, Any] | None = None,
         background: str | float = "median",
         frame: int | None = None,
@@ -271,10 +271,11 @@ class Cells(metaclass=checks.KnownKeywords):
         Requires the extra `images`.
 
         image: an array (rows, columns) of whole numbers; a file .tif, .png or .npy (of Omnipose or
-        Cellpose: NAME_cp_masks.tif); or a results file .nc of DeLTA. pixel_size: µm a pixel. frame:
-        of a stack, −1 is the last; of DeLTA, the number that it gave. The centre of the first pixel
-        is the origin, x goes to the right and y up, so that cells have y ≤ 0. centre: move the mean
-        of the centres to the origin.
+        Cellpose: NAME_cp_masks.tif); or a results file .nc of DeLTA. pixel_size: µm a pixel, None
+        for what an OME-TIFF or a TIFF of ImageJ states. frame: of a stack, −1 is the
+        last; of DeLTA, the number that it gave. The centre of the first pixel is the origin, x goes
+        to the right and y up, so that cells have y ≤ 0. centre: move the mean of the centres to the
+        origin.
 
         fluorescence: images of the mask's shape by field, {"gfp": "gfp.tif"}; frame picks from
         them, too. Each cell gets the field `gfp`, the mean of the pixels in its region less the

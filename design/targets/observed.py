@@ -135,7 +135,7 @@ class Observed(Target):
     def from_masks(
         masks: Any,
         *,
-        pixel_size: float,
+        pixel_size: float | None = None,
         fluorescence: Mapping[str, Any] | None = None,
         background: str | float = "median",
         species: Sequence[str] | None = None,

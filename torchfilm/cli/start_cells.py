@@ -83,8 +83,6 @@ def _read(path: Path, given: dict[str, Any]) -> Cells:
         return Cells.from_table(path, **given)
     if kind in MASKS:
         _leave_out(given, path, "a label image", "length_unit", "angle_unit")
-        if "pixel_size" not in given:
-            raise checks.input_error("--pixel-size", None, f"given for {path}: µm a pixel")
         return Cells.from_masks(path, **given)
     if is_results(path):
         _leave_out(given, path, "a results file", "pixel_size", "length_unit", "angle_unit")

@@ -10,6 +10,7 @@ import numpy as np
 from torchfilm.micrographs.capsule_fit import capsule_of_area
 from torchfilm.micrographs.fluorescence import check_fluorescence, mean_fluorescence
 from torchfilm.micrographs.mask_files import EXTRA, read_image
+from torchfilm.micrographs.pixel_sizes import pixel_size_of
 from torchfilm.micrographs.record import Micrograph, listed
 from torchfilm.tools import checks
 from torchfilm.tools.warn_once import warn
@@ -28,7 +29,7 @@ MOST = 2**53  # whole numbers above this are not exact as floats
 def mask_cells(
     image: Any,
     *,
-    pixel_size: float,
+    pixel_size: float | None,
     fluorescence: Mapping[str, Any] | None,
     background: str | float,
     frame: int | None,
@@ -42,7 +43,7 @@ def mask_cells(
     axis. The pixels are taken as points, which leaves no bias: the sum over pixel centres in a
     shape is, on average over its place, the integral over the shape.
     """
-    checks.number("pixel_size", pixel_size, above=0.0, hint="µm a pixel.")
+    pixel_size = pixel_size_of(image, pixel_size)
     checks.number("least_area", least_area, least=4, hint="Pixels.")
     checks.choice("centre", centre, (True, False))
     channels = check_fluorescence(fluorescence, background)
