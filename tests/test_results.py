@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import subprocess
 import sys
 import textwrap
@@ -34,6 +35,15 @@ def test_every_seventh_step_and_the_last_are_there(whole):
         assert results.times[-1] == pytest.approx(UNTIL, rel=1e-12)
         assert np.array_equal(results.counts, [states[k].counts.tolist() for k in results.steps])
         assert results.colony_id.tolist() == [0, 1, 2]
+
+
+def test_another_process_gets_a_file_of_its_own(whole):
+    path, _ = whole
+    with tf.Results(path) as results:
+        sent = pickle.dumps(results)
+        with pickle.loads(sent) as other:
+            assert other.file is not results.file and other.times.tolist() == [*results.times]
+        assert len(results) == 10  # closing the other leaves it open
 
 
 def test_frames_are_the_states(whole):

@@ -48,8 +48,24 @@ def test_a_run_is_silent_unless_asked(monkeypatch):
 def test_true_shows_a_bar_anywhere_with_the_last_state(monkeypatch):
     monkeypatch.setattr(sys, "stderr", io.StringIO())
     run(progress=True)
-    last = sys.stderr.getvalue().split("\r")[-1]
+    last = sys.stderr.getvalue().splitlines()[-1]
     assert "100%" in last and "2 cells, t = 0.50 h" in last and "steps/s" in last
+
+
+def test_a_file_gets_a_line_now_and_then(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    run(progress=True)
+    lines = sys.stderr.getvalue().splitlines()
+    assert "\r" not in sys.stderr.getvalue() and len(lines) == 2  # the first and the last state
+    assert "0%" in lines[0] and "100%" in lines[1]
+    monkeypatch.setattr(progress, "LINES", 0.0)
+    with progress.bar(3, "search") as bar:
+        for _ in range(3):
+            bar.update(1)
+            bar.refresh()
+    assert [line.split("|")[2].split()[0] for line in sys.stderr.getvalue().splitlines()[2:]] == [
+        "0%", "33%", "67%", "100%"
+    ]  # fmt: skip
 
 
 def test_a_bar_in_a_notebook_is_html_and_writes_no_line(monkeypatch, notebook):

@@ -68,6 +68,9 @@ class Results(metaclass=checks.KnownKeywords):
         """Close the file, as leaving `with` does; again does nothing."""
         self.file.close()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.path.resolve(),)  # another process opens the file anew
+
     def __len__(self) -> int:
         return frame_count(self.file)
 

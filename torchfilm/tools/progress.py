@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 FORM = "{desc} |{bar}| {percentage:3.0f}% {elapsed}<{remaining}{postfix}"
 SECONDS = 0.1  # between two looks at a run; the bar itself is drawn every 0.3 s
+LINES = 30.0  # seconds between two lines where stderr is a file, as of a job on a cluster
 
 
 def wanted(progress: bool | None) -> bool:
@@ -30,15 +31,18 @@ def wanted(progress: bool | None) -> bool:
 
 
 def bar(total: float, label: str, form: str = FORM) -> tqdm:
-    """A bar of tqdm: on stderr in a script, as HTML below the cell in a notebook. form: as
-    tqdm's `bar_format`. Raises InputError where tqdm is missing."""
+    """A bar of tqdm: on stderr in a script, in a file a line now and then, as HTML below a cell in
+    a notebook. form: as tqdm's `bar_format`. Raises InputError where tqdm is missing."""
     try:
         from tqdm import tqdm
     except ImportError as error:
         raise checks.InputError(
             f"a progress bar needs tqdm: {checks.install('app')}, or give progress=False."
         ) from error
-    kind = _notebook_bar(tqdm) if in_notebook() else tqdm
+    if in_notebook():
+        kind = _notebook_bar(tqdm)
+    else:
+        kind = tqdm if sys.stderr is not None and sys.stderr.isatty() else _lines(tqdm)
     return kind(total=total, bar_format=form, desc=label, mininterval=0.3)
 
 
@@ -74,6 +78,38 @@ def _notebook_bar(tqdm: Any) -> Any:
             pass
 
     return NotebookBar
+
+
+def _lines(tqdm: Any) -> Any:
+    """The class of bars in a file, where a bar cannot be drawn over the last one."""
+
+    class Lines(tqdm):
+        def __init__(self, **options: Any):
+            self.written, self.last = -math.inf, ""
+            super().__init__(**options, ncols=100, file=io.StringIO())
+
+        def display(self, msg: str | None = None, pos: int | None = None) -> bool:
+            now = time.perf_counter()
+            if msg is None and now - self.written >= LINES:
+                self.written = now
+                self._write()
+            return True
+
+        def close(self) -> None:
+            if not self.disable:  # of a bar that is open
+                self._write()
+            super().close()
+
+        def _write(self) -> None:
+            words = str(self)
+            if sys.stderr is not None and words != self.last:
+                print(words, file=sys.stderr, flush=True)
+            self.last = words
+
+        def clear(self, *args: Any, **options: Any) -> None:
+            pass
+
+    return Lines
 
 
 class RunBar:
