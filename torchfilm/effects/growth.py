@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchfilm.effect import GROWTH, Binding, BoundEffect, Effect, is_own
 from torchfilm.resolver import Values
-from torchfilm.state import Field, State
+from torchfilm.state import CELL, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.doubling import check_doubling
 from torchfilm.tools.warn_once import warn
@@ -53,6 +53,11 @@ class Growth(Effect):
     ln 2/rate, whatever its shape (the paper's wording); "length", dl/dt = rate·l of the centreline
     (the authors' program); "linear", dl/dt = rate. Exponentials are exact over a step.
 
+    species: in place of a rate, the name of a species of a circuit that is µm³ of growth per µm³ of
+    cell. In each step a cell grows by all of it that there is, which is spent with that: by
+    species · V, exactly. So a circuit may live on several nutrients and pay for growth. The law is
+    "volume".
+
     The number of cells doubles more slowly. A division at the length l makes two new caps of radius
     r, so that daughters begin at (l − 2r)/2: by "volume" they divide again after ln((l + 4r/3)/(l/2
     + r/3))/rate, by "length" after ln(2l/(l − 2r))/rate. With l = 4 µm and r = 0.5 µm that is
@@ -61,6 +66,7 @@ class Growth(Effect):
 
     rate: Value | None = physical(None, unit="1/h", least=0.0, drawn_by_effect=True)
     law: str = "volume"
+    species: str | None = None
 
     stage = GROWTH
     title = "growth"
@@ -69,6 +75,14 @@ class Growth(Effect):
 
     def __post_init__(self) -> None:
         checks.choice("Growth.law", self.law, LAWS)
+        if self.species is None:
+            return
+        if not (isinstance(self.species, str) and self.species.isidentifier()):
+            raise checks.input_error("Growth.species", self.species, "the name of one species")
+        if self.rate is not None:
+            hint = "Leave rate out, or species."
+            raise checks.input_error("Growth.rate", self.rate, "left out with species", hint)
+        checks.choice("Growth.law, with species", self.law, ("volume",))
 
     @property
     def by_type(self) -> bool:
@@ -96,16 +110,27 @@ class Growth(Effect):
         return {"rate": "growth_rate"}
 
     def at_least_zero(self) -> tuple[str, ...]:
-        return ("growth_rate",)
+        return ("growth_rate", *self._paid())
+
+    def _paid(self) -> tuple[str, ...]:
+        return () if self.species is None else (self.species,)
+
+    @property
+    def sets_rate(self) -> bool:
+        """Whether it sets growth_rate in each step."""
+        return self.by_type or self.species is not None
 
     def reads(self) -> tuple[str, ...]:
-        return ("growth_rate", "length", "radius")
+        return (*(self._paid() or ("growth_rate",)), "length", "radius")
 
     def waits_for(self) -> Mapping[str, str]:
+        if self.species is not None:
+            return {self.species: "a rate of it in a circuit"}
         return {"growth_rate": "a parameter above 0 (such as rate=1.0)"}
 
     def writes(self) -> tuple[str, ...]:
-        return ("length", "elongation", *(("growth_rate",) if self.by_type else ()))
+        rate = ("growth_rate",) if self.sets_rate else ()
+        return ("length", "elongation", *rate, *self._paid())
 
     def check_scene(self, effects: Sequence[Effect], founders: Any) -> None:
         redrawn = self.rate is not None and is_drawn(self.rate) and not is_inherited(self.rate)
@@ -118,11 +143,39 @@ class Growth(Effect):
             )
         others = [e for e in effects if e is not self]
         sets = any(is_own(e) or e.writes_anything or "growth_rate" in e.writes() for e in others)
-        if self.rate is None and not sets and "growth_rate" not in founders.extra:
+        for name in self._paid():
+            self._check_species(name, others)
+        if self.rate is None and not (sets or self.species or "growth_rate" in founders.extra):
             warn(
                 "Growth() has no rate, and no rule or nutrition sets growth_rate: nothing grows."
                 " Write tf.Growth(rate=1.0), in 1/h."
             )
+
+    def _check_species(self, name: str, others: Sequence[Effect]) -> None:
+        """Raise InputError where growth would not be what the species says."""
+        for other in others:
+            own = getattr(other, "own_fields", ())
+            if name in own and name not in getattr(other, "diluted_fields", own):
+                raise checks.InputError(
+                    f"Growth.species = {name!r}: growth does not dilute this species, so that cells"
+                    " would grow by more or less than was paid for. Leave out Circuit.dilution, or"
+                    f" name {name!r} in it."
+                )
+            if "growth_rate" in other.writes():
+                raise checks.InputError(
+                    f"{other.title} sets growth_rate, and Growth.species = {name!r} sets it again"
+                    " in each step. Keep one of them."
+                )
+
+    def check(self, state: State, values: Values) -> None:
+        for name in self._paid():
+            declared = state.declared.get(name)
+            if declared is None or declared.scope != CELL or declared.shape:
+                there = [n for n, f in state.declared.items() if f.scope == CELL and not f.shape]
+                rule = "a species of a circuit, or a variable with one number for each cell"
+                raise checks.input_error(
+                    "Growth.species", name, rule, f"There are: {', '.join(there)}."
+                )
 
     def check_step(self, dt: float, divides: bool) -> None:
         if self.rate is None or not divides or self.law == "linear":
@@ -136,7 +189,8 @@ class Growth(Effect):
 
     def numerics(self, dt: float, state: State) -> list[str]:
         held = "; what contacts hold back is taken off afterwards"
-        return ["exact over a step" + (held if "displacement" in state.fields else "")]
+        by = "exact over a step" if self.species is None else f"by all {self.species} that there is"
+        return [by + (held if "displacement" in state.fields else "")]
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         return (_BoundGrowth(self, binding),)
@@ -144,6 +198,12 @@ class Growth(Effect):
     def step(self, state: State, dt: float, values: Values) -> State:
         if self.by_type:
             state = state.with_fields(growth_rate=values.rate.of_cells(state))
+        if self.species is not None:
+            paid = state.fields[self.species]
+            state = state.with_fields(
+                growth_rate=(torch.log1p(paid) / dt).to(state.growth_rate.dtype),
+                **{self.species: torch.zeros_like(paid)},
+            )
         relative = state.growth_rate * dt
         if self.law != "linear":
             relative = torch.expm1(relative)

@@ -77,8 +77,8 @@ class Monod(Effect):
     title = "nutrition"
     may_repeat = False
     instead_of_two = (
-        "Cells on several nutrients: let circuits take them up, and a rule set growth_rate by what"
-        " they have taken."
+        "Cells on several nutrients: let a circuit take them up, and pay for growth by a species of"
+        " its own: tf.Growth(species=…)."
     )
 
     def declares(self, dim: int) -> tuple[Field, ...]:
