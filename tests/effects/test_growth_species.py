@@ -69,7 +69,9 @@ def test_the_growth_rate_is_that_of_the_species_to_second_order(dt, off):
 
 def plain(u, s, p, cell):
     """Hungry cells, and no thought of the size that cells will have."""
-    pace = p.rate * torch.minimum(s.glucose / (1e-3 + s.glucose), s.oxygen / (1e-3 + s.oxygen))
+    pace = p.rate * torch.minimum(
+        s.glucose / (1e-3 + s.glucose), s.oxygen / (5e-3 * p.K + s.oxygen)
+    )
     cost = pace * cell.volume * torch.exp(0 * p.dt)
     return {"grown": pace}, {"glucose": -cost / p.per_glucose, "oxygen": -cost / p.per_oxygen}
 
