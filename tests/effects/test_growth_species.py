@@ -19,7 +19,7 @@ def eats(u, s, p, cell):
 
 
 def scene(*more, contacts=True, backend="compiled", dt=DT, initial=1.0, law=eats) -> tf.Scene:
-    fed = tf.Signal(diffusion=100.0, initial=initial)
+    fed = tf.Signal(diffusion=1e4, initial=initial)
     return tf.Scene(
         tf.Growth(species="grown"),
         tf.Division(length=tf.Uniform(3.5, 4.0), conserves="volume"),
@@ -69,9 +69,8 @@ def test_the_growth_rate_is_that_of_the_species_to_second_order(dt, off):
 
 def plain(u, s, p, cell):
     """Hungry cells, and no thought of the size that cells will have."""
-    pace = p.rate * torch.minimum(
-        s.glucose / (1e-3 + s.glucose), s.oxygen / (5e-3 * p.K + s.oxygen)
-    )
+    half = 0.02 * p.K
+    pace = p.rate * torch.minimum(s.glucose / (half + s.glucose), s.oxygen / (half + s.oxygen))
     cost = pace * cell.volume * torch.exp(0 * p.dt)
     return {"grown": pace}, {"glucose": -cost / p.per_glucose, "oxygen": -cost / p.per_oxygen}
 
