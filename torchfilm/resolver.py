@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchfilm.signals.schedule import Schedule
 from torchfilm.state import Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.parts import mapped
@@ -137,6 +138,39 @@ class Resolved:
 
 
 @dataclass(frozen=True, eq=False)
+class Scheduled(Resolved):
+    """A value that changes in time. each: of the values of the schedule, in their order; all alike
+    in what they depend on."""
+
+    schedule: Schedule = field(kw_only=True)
+    each: tuple[Resolved, ...] = field(kw_only=True)
+
+    def now(self, state: State) -> Resolved:
+        """What holds at the time of a state."""
+        return self.each[self.schedule.place(state.time)]
+
+    def of_colonies(self, state: State) -> Tensor:
+        return self.now(state).of_colonies(state)
+
+    def of_cells(self, state: State, kind: int | None = None) -> Tensor:
+        return self.now(state).of_cells(state, kind)
+
+    def of_rows(self, state: State, rows: Tensor, purpose: str | None = None) -> Tensor:
+        return self.now(state).of_rows(state, rows, purpose)
+
+    def constant(self, kind: int | None = None) -> None:
+        return None
+
+    @property
+    def requires_grad(self) -> bool:
+        return any(x.requires_grad for x in self.each)
+
+    @cached_property
+    def is_zero(self) -> bool:
+        return all(x.is_zero for x in self.each)
+
+
+@dataclass(frozen=True, eq=False)
 class BoundDraw:
     """How the values of cells are drawn: by one distribution, or by one value for each cell type.
     others: the type whose value cells of types without one get; None: there may be no such cells.
@@ -228,6 +262,8 @@ def resolve(
     many numbers can be meant as either."""
     if value is None:
         return None
+    if isinstance(value, Schedule):
+        return _scheduled(name, value, batch, typed)
     if is_drawn(value):
         return Resolved(name, draw=_bound_draw(name, value, batch), field=field)
     if isinstance(value, ByType):
@@ -237,6 +273,34 @@ def resolve(
             each = [v.expand(batch.colonies) for v in each]
         return Resolved(name, torch.stack(each), types=torch.tensor(kinds, device=batch.device))
     return Resolved(name, _per_colony(name, value, batch, listed=typed))
+
+
+def _scheduled(name: str, value: Schedule, batch: BoundBatch, typed: bool) -> Scheduled:
+    each = [
+        resolve(f"{name}, from {t:g} h", x, batch, typed=typed) for t, x in value.values.items()
+    ]
+    found = [x for x in each if x is not None and x.value is not None]
+    kinds = [x.types for x in found]
+    first = kinds[0]
+    for time, types in zip(value.times, kinds, strict=True):
+        same = types is first or (first is not None and types is not None and types.equal(first))
+        if not same:
+            raise checks.input_error(
+                f"{name}, from {time:g} h", value.values[time],
+                "given for the same cell types as the value from 0 h",
+            )  # fmt: skip
+    # kernels are made for one number, or for one per colony
+    shape = max((x.value.shape for x in found if x.value is not None), key=len)
+    alike = [dataclasses.replace(x, value=_spread(x, shape)) for x in found]
+    return Scheduled(name, types=first, schedule=value, each=tuple(alike))
+
+
+def _spread(one: Resolved, shape: torch.Size) -> Tensor:
+    assert one.value is not None
+    own = one.value
+    if one.types is not None and own.dim() == 1 and len(shape) == 2:
+        own = own.unsqueeze(1)
+    return own.expand(shape).contiguous() if own.shape != shape else own
 
 
 def _bound_draw(name: str, value: Any, batch: BoundBatch) -> BoundDraw:

@@ -18,13 +18,14 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from numbers import Integral
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from torchfilm.signals.schedule import Schedule
+from torchfilm.signals.schedule import Schedule, checked_values
 from torchfilm.tools import checks
 
 if TYPE_CHECKING:
@@ -79,6 +80,8 @@ class Rule:
     # whether the effect itself draws from a distribution, and when; else each cell's value is a
     # field drawn at birth
     drawn_by_effect: bool = False
+    # whether it may be a Schedule
+    scheduled: bool = False
 
 
 def physical(default: Any = dataclasses.MISSING, **rule: Any) -> Any:
@@ -95,9 +98,11 @@ def checked(name: str, given: object, rule: Rule, forms: str = FORMS) -> Any:
     """
     bounds: dict[str, Any] = {"above": rule.above, "least": rule.least, "most": rule.most}
     if isinstance(given, Schedule):
+        if rule.scheduled:
+            return checked_values(name, given, partial(_checked_in_schedule, rule))
         hint = (
-            "A Schedule is for the source, flow, reservoir and faces of a Medium; rates and rules"
-            " take its value as schedule(cell.time)."
+            "A Schedule is for the source, flow, reservoir and faces of a Medium, and for the"
+            " constants of a Circuit; rules take its value as schedule(cells.time)."
         )
         raise checks.input_error(name, given, "constant", hint)
     if isinstance(given, ByType):
@@ -147,6 +152,13 @@ def checked(name: str, given: object, rule: Rule, forms: str = FORMS) -> Any:
         return PerColony(inner)
     hint = forms if rule.scope == CELL else checks.ONE_OR_EACH
     return checks.value(name, given, hint=hint, **bounds)
+
+
+def _checked_in_schedule(rule: Rule, name: str, given: Any) -> Any:
+    value = checked(name, given, rule)
+    if is_drawn(value):
+        raise checks.input_error(name, given, "a number, one per colony, or one per cell type")
+    return value
 
 
 def numbers(value: Any) -> Tensor:

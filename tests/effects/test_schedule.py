@@ -1,5 +1,5 @@
-"""Media whose sources, faces, flow and reservoirs change at given times, and inputs of rates and
-rules that do."""
+"""Media whose sources, faces, flow and reservoirs change at given times, and constants of circuits
+and inputs of rules that do."""
 
 import dataclasses
 import math
@@ -159,20 +159,26 @@ def test_recorded_growth_meets_it():
     assert_equal(state, runs(scene, 1.25, dt=None))
 
 
-@pytest.mark.parametrize("backend", ["compiled", "torch"])
-def test_rates_and_rules_take_its_value(backend):
-    light = tf.Schedule({0: 0.0, 0.5: 1.0, 1: 0.0}, period=1.5)
+def lit(u, s, p, cell):
+    return {"dye": p.k * p.light - u.dye}
 
-    def rates(u, s, p, cell):
-        return {"dye": p.k * light(cell.time) - u.dye}
+
+def summed(u, s, p, cell):
+    return {"dye": p.light + 0 * u.dye}
+
+
+@pytest.mark.parametrize("method", ["rosenbrock", "rk4"])
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_constants_of_rates_and_rules_take_its_value(backend, method):
+    light = tf.Schedule({0: 0.0, 0.5: 1.0, 1: 0.0}, period=1.5)
 
     def see(cells):
         cells.seen = light(cells.time)
 
-    scene = tf.Scene(
-        tf.Circuit(rates, species="dye", k=2.0, rtol=1e-6, backend=backend),
-        tf.Rules(see, variables={"seen": 0.0}), dim=2,
-    )  # fmt: skip
+    circuit = tf.Circuit(
+        lit, species="dye", k=2.0, light=light, rtol=1e-6, backend=backend, method=method, steps=9
+    )
+    scene = tf.Scene(circuit, tf.Rules(see, variables={"seen": 0.0}), dim=2)
     expected = 0.0
     for state in tf.simulate(scene.bind(**F64), until=3.0, dt=0.05):
         k = round(state.time / 0.05) - 1
@@ -182,20 +188,88 @@ def test_rates_and_rules_take_its_value(backend):
         assert float(state.seen) == on
 
 
-@pytest.mark.parametrize("backend", ["compiled", "torch"])
-def test_its_values_are_as_exact_as_the_time(backend):
-    slow = tf.Schedule({0: 0.1, 5: 0.3})
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_change_in_the_middle_of_a_step_is_seen_there_in_any_dtype(dtype):
+    """At 40 times 0.1 k + 0.05, which float32 does not hold exactly."""
+    light = tf.Schedule({0: 0.0, 0.05: 1.0}, period=0.1)
+    circuit = tf.Circuit(summed, species="dye", light=light, dilution=False)
+    with pytest.warns(UserWarning, match=r"has the value of 0 h in no step of 0\.1 h: it is lost"):
+        end = runs(tf.Scene(circuit, dim=2), 4.0, dt=0.1, dtype=dtype)
+    assert float(end.dye) == pytest.approx(4.0, rel=1e-5)
 
-    def rates(u, s, p, cell):
-        return {"dye": slow(cell.time)}
 
-    circuit = tf.Circuit(rates, species="dye", method="rk4", backend=backend)
-    end = runs(tf.Scene(circuit, dim=2), 0.4, **F64)
-    assert float(end.dye) == pytest.approx(0.04, rel=1e-14)
-    time = torch.tensor([4.0, 6.0], dtype=torch.float64)
-    assert slow(time).tolist() == [0.1, 0.3] and slow(np.float32(6.0)) == 0.3
-    with pytest.raises(tf.InputError, match="value of a Schedule in rates and rules"):
-        tf.Schedule({0: (1.0, 0.0)})(time)
+def test_values_by_colony_and_by_type():
+    pulse = tf.Schedule({0: {0: 1.0, 1: 2.0}, 1: {0: torch.tensor([0.0, 5.0]), 1: 0.0}})
+    ends = []
+    for backend in ("compiled", "torch"):
+        circuit = tf.Circuit(
+            {0: summed, 1: summed}, species="dye", light=pulse, dilution=False, backend=backend
+        )
+        founders = tf.Cells([[0.0, 0.0], [9.0, 0.0]], [[1.0, 0.0]] * 2, cell_type=[0, 1])
+        model = tf.Scene(circuit, founders=founders).bind(2, dtype=torch.float64)
+        *_, end = tf.simulate(model, until=2.0, dt=0.05)
+        ends.append(end.dye.tolist())
+    assert ends[0] == pytest.approx([1.0, 2.0, 6.0, 2.0]) and ends[1] == pytest.approx(ends[0])
+
+
+def test_molecules_follow_it():
+    """Made while it is on, 100/h, and kept: some 100 in each of 40 colonies; no more come later."""
+    making = [tf.Reaction.of("0 -> dye", rate="light")]
+    circuit = tf.Circuit(
+        making, species="dye", light=tf.Schedule({0: 100.0, 1: 0.0}), method="tau_leap"
+    )
+    one = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 2.0, 0.5)
+    counts = []
+    for state in tf.simulate(
+        tf.Scene(circuit, founders=one), until=2.0, dt=0.05, colonies=40, seed=1
+    ):
+        if state.step in (20, 40):
+            counts.append(state.dye * state.volume)
+    mean = 100.0 * math.pi * 0.25 * (2.0 + 4 / 3 * 0.5)
+    assert float(counts[0].mean()) == pytest.approx(mean, abs=4 * math.sqrt(mean / 40))
+    assert torch.equal(counts[0], counts[1])
+
+
+def test_gradients_and_searches_reach_its_values():
+    strength = torch.tensor([1.0, 3.0], dtype=torch.float64, requires_grad=True)
+    circuit = tf.Circuit(
+        summed, species="dye", light=tf.Schedule({0: 0.0, 0.5: strength}), dilution=False
+    )
+    model = tf.Scene(circuit, dim=2).bind(2, dtype=torch.float64)
+    state = model.start()
+    for _ in range(20):
+        state = model.step(state, 0.05)
+    assert state.dye.tolist() == pytest.approx([0.5, 1.5])
+    (slope,) = torch.autograd.grad(state.dye.sum(), strength)
+    assert slope.tolist() == pytest.approx([0.5, 0.5])
+
+
+def test_other_values_take_no_other_kernel():
+    made = [
+        tf.Circuit(lit, species="dye", k=1.0, light=tf.Schedule({0: x, t: 0.0})).graph
+        for x, t in ((1.0, 0.5), (2.0, 0.75))
+    ]
+    assert str(made[0]) == str(made[1]) and "k·light" in str(made[0])
+
+
+def test_tables_name_its_values_by_their_times(tmp_path):
+    pulse = tf.Schedule({0: torch.tensor([1.0, 2.0]), 0.3: 3 * torch.ones(2), 1.3: 0.0})
+    scene = tf.Scene(tf.Circuit(summed, species="dye", light=pulse), medium(pulse, "source"), dim=2)
+    for _ in tf.simulate(scene, until=0.1, dt=0.05, colonies=2, record=tmp_path / "run.h5"):
+        pass
+    with tf.Results(tmp_path / "run.h5") as results:
+        columns = results.table(-1).keys()
+    assert {"light[0.0]", "light[0.3]", "source[0.0]", "source[0.3]"} <= set(columns)
+
+
+def test_a_call_takes_times():
+    slow = tf.Schedule({0: 0.1, 5: 0.3}, period=8.0)
+    assert slow(np.float32(6.0)) == 0.3 and slow(9) == 0.1
+    assert slow(np.array([[1.0, 5.0], [9.0, 13.0]])).tolist() == [[0.1, 0.3], [0.1, 0.3]]
+    assert slow([4, 6]).tolist() == [0.1, 0.3]
+    called = lambda u, s, p, cell: {"dye": slow(cell.time) + 0 * u.dye}
+    with pytest.raises(tf.InputError, match=r"Circuit\(…, light=schedule\).*p\.light"):
+        tf.Scene(tf.Circuit(called, species="dye"), dim=2).bind().start()
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -226,13 +300,14 @@ def test_only_what_changes_is_prepared_again():
 
 def test_a_schedule_of_the_module_counts_for_a_study():
     space = {}
-    code = "def lit(u, s, p, cell): return {'dye': light(cell.time)}"
-    exec(compile(code, "lit.py", "exec"), space)
+    exec(compile("def see(cells): cells.seen = light(cells.time)", "see.py", "exec"), space)
     found = []
     for value in (1.0, 9.0):
         space["light"] = tf.Schedule({0: value})
-        found.append(tf.digest(space["lit"]))
+        found.append(tf.digest(space["see"]))
     assert found[0] != found[1]
+    one, other = (tf.Circuit(summed, species="dye", light=tf.Schedule({0: x})) for x in (1.0, 9.0))
+    assert one != other
 
 
 def test_the_time_of_a_change_is_told():
@@ -244,6 +319,12 @@ def test_a_change_within_a_step_is_warned_of():
     scene = grown(medium(tf.Schedule({0: 1.0, 0.52: 0.0}), "source"))
     with pytest.warns(UserWarning, match=r"source of food changes at 0\.52 h, within a step"):
         runs(scene, 0.1)
+    lost = tf.Schedule({0: 0.0, 0.105: 10.0, 0.115: 0.0})
+    with pytest.warns(UserWarning, match=r"source of food has the value of 0\.105 h in no step of"):
+        runs(grown(medium(lost, "source")), 0.2)
+    drug = tf.Circuit(summed, species="dye", light=lost)
+    with pytest.warns(UserWarning, match=r"Circuit\.light has the value of 0\.105 h in no step"):
+        runs(tf.Scene(drug, dim=2), 0.2)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from torchfilm.circuits.tracing import Untraceable
 from torchfilm.circuits.trial import try_circuit
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.circuit_cells import Kind, cell_column, cell_names, cells_of_type
-from torchfilm.effects.circuit_checks import check_read
+from torchfilm.effects.circuit_checks import check_read, schedules_of
 from torchfilm.effects.circuit_kernels import CircuitKernels, PreparedStep, Taken
 from torchfilm.effects.circuit_report import Failures
 from torchfilm.effects.circuit_words import methods_of, together_lines
@@ -230,6 +230,7 @@ class BoundCircuit(BoundEffect):
         transport = self.plan.transport  # where it is solved together with circuits
         exchanged = () if transport else self.exchanges()
         lines = methods_of(self.effect, dt, self.plan.turns, self._why_torch(), exchanged)
+        lines += [f"{n} {x.told}" for n, x in schedules_of(self.effect).items()]
         if transport:
             dt = dt / transport.medium.steps
             rates = {n: transport.exchanges_per_hour(n, state) for n in self.exchanges()}

@@ -31,6 +31,7 @@ from torchfilm.effects.circuit_checks import (
     check_initial,
     check_method,
     check_rates,
+    check_schedules,
     check_species,
     diluted_names,
     equations_of,
@@ -49,6 +50,7 @@ from torchfilm.values import COLONY, CONCENTRATION, Rule, Value, checked
 Part = run.RateFunction | Sequence[Reaction | Sequence[Reaction]]
 
 EVERY = "every cell"  # where a circuit runs that is not given by type
+CONSTANT, POSITIVE = Rule(scheduled=True), Rule(least=0.0, scheduled=True)
 EACH_CELL = "initial[{!r}]"  # by which name the first value of a species is resolved
 
 
@@ -149,7 +151,7 @@ class Circuit(Effect):
                 "Circuit.molecules_per_unit", molecules_per_unit, Rule(above=0.0, scope=COLONY)
             ),
             "parameters": {
-                n: checked(f"Circuit.{n}", v, first if n in mass_action else Rule())
+                n: checked(f"Circuit.{n}", v, POSITIVE if n in mass_action else CONSTANT)
                 for n, v in parameters.items()
             },
         }
@@ -322,7 +324,7 @@ class Circuit(Effect):
         first = Rule(least=0.0, drawn_by_effect=True)
         found = {EACH_CELL.format(n): (self.initial.get(n, 0.0), first) for n in self.species}
         found["molecules_per_unit"] = (self.molecules_per_unit, Rule(above=0.0, scope=COLONY))
-        return found | {n: (v, Rule()) for n, v in self.parameters.items()}
+        return found | {n: (v, CONSTANT) for n, v in self.parameters.items()}
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         again = self.diluted_fields if self.resets else ()
@@ -347,6 +349,9 @@ class Circuit(Effect):
             ' Give one circuit a name, Circuit(…, name="second"), or share the species, Circuit(…,'
             f" shared=({name!r},))."
         )
+
+    def check_step(self, dt: float, divides: bool) -> None:
+        check_schedules(self, dt)
 
     def at_least_zero(self) -> tuple[str, ...]:
         return self.own_fields

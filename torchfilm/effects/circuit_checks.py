@@ -11,6 +11,7 @@ from typing import Any
 from torchfilm.circuits import integrators
 from torchfilm.circuits.names import unknown
 from torchfilm.circuits.reactions import Reaction
+from torchfilm.signals.schedule import Schedule
 from torchfilm.state import PER_CELL, RESERVED
 from torchfilm.tools import checks
 from torchfilm.tools.warn_once import warn
@@ -129,7 +130,8 @@ def check_constants(given: Mapping[str, Any], options: Sequence[str]) -> None:
         near = checks.nearest(name, options)
         # a dict by names is meant for an option such as `initial`; a constant goes by cell types
         by_names = isinstance(value, Mapping) and any(isinstance(key, str) for key in value)
-        if isinstance(value, str) or callable(value) or (near and by_names):
+        function = callable(value) and not isinstance(value, Schedule)
+        if isinstance(value, str) or function or (near and by_names):
             hint = f"Did you mean {near}?" if near else FORMS
             allowed = "a constant of the rates, as further keywords are"
             raise checks.input_error(f"Circuit.{name}", value, allowed, hint)
@@ -185,3 +187,14 @@ def check_read(circuit: Any, read: set[str]) -> None:
         like = difflib.get_close_matches(name, known, 1)
         hint = f". Did you mean {like[0]!r}?" if like else f": remove it, or use it as p.{name}."
         warn(f"Circuit.{name} is a constant that no rate reads{hint}")
+
+
+def schedules_of(circuit: Any) -> dict[str, Schedule]:
+    """Its constants that change in time."""
+    return {n: x for n, x in circuit.parameters.items() if isinstance(x, Schedule)}
+
+
+def check_schedules(circuit: Any, dt: float) -> None:
+    """Warn where steps of dt hours do not follow them."""
+    for name, schedule in schedules_of(circuit).items():
+        schedule.warn_of_step(f"{circuit.value_owner()}.{name}", dt, late=0.5)

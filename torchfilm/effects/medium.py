@@ -30,7 +30,6 @@ from torchfilm.signals.transport_series import MOST
 from torchfilm.state import COLONY, GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import check_backend, why_torch
-from torchfilm.tools.warn_once import warn
 from torchfilm.values import CONCENTRATION
 
 OUTSIDE_CELLS = ("error", "grow", "reservoir")
@@ -234,14 +233,7 @@ class Medium(Effect):
 
     def check_step(self, dt: float, divides: bool) -> None:
         for what, schedule in self._scheduled().items():
-            moments = (*schedule.times, schedule.period or 0.0)
-            between = [t for t in moments if abs(t / dt - round(t / dt)) > 1e-6]
-            if between:
-                warn(
-                    f"the Schedule of {what} changes at {between[0]:g} h, within a step of {dt:g}"
-                    " h: its value holds from the next step on. Let the times, and the period, be"
-                    " multiples of dt."
-                )
+            schedule.warn_of_step(f"the Schedule of {what}", dt)
 
     def _scheduled(self) -> dict[str, Schedule]:
         """The schedules, by what they are of."""

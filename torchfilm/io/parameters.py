@@ -86,6 +86,7 @@ def column_names(paths: list[str], taken: set[str]) -> dict[str, str]:
 
 def _ends(path: str) -> list[str]:
     """The ends of a path, the shortest first: "diffusion", "ahl.diffusion", … of
-    "Medium.signals['ahl'].diffusion"."""
-    words = re.sub(r"\['([^']*)'\]", r".\1", path).split(".")
+    "Medium.signals['ahl'].diffusion", and "light[0.5]" of a schedule's value from 0.5 h."""
+    plain = re.sub(r"\['([^']*)'\]", r".\1", path).replace(".values[", "[")
+    words = re.split(r"\.(?![^\[]*\])", plain)
     return [".".join(words[k:]) for k in range(len(words) - 1, -1, -1)]

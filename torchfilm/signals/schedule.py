@@ -1,4 +1,4 @@
-"""Values of a medium that change at given times."""
+"""Values of media and circuits that change at given times."""
 
 from __future__ import annotations
 
@@ -9,27 +9,30 @@ from functools import cached_property
 from numbers import Real
 from typing import Any
 
-import torch
+import numpy as np
 
 from torchfilm.tools import checks
 from torchfilm.tools.parts import mapped
+from torchfilm.tools.warn_once import warn
 
 # Hours, relative to the time: what times gather by rounding, far below any step.
 ROUNDING = 1e-9
+MOST_LOOKED_AT = 100_000  # steps, to see whether each value holds in one
 
 
 @dataclass(frozen=True, eq=False)
 class Schedule(metaclass=checks.KnownKeywords):
-    """A value of a medium that changes at given times: `tf.Schedule({0: 0.0, 2: 1.0, 3: 0.0})` is 1
-    from 2 to 3 h, and 0 before and after.
+    """A value that changes at given times: `tf.Schedule({0: 0.0, 2: 1.0, 3: 0.0})` is 1 from 2 to
+    3 h, and 0 before and after.
 
-    values: by the time, h, from which each holds; one holds from 0 h. Each is what the medium would
-    take in place of the schedule. period: hours after which the values begin again; None: the last
-    value stays.
+    values: by the time, h, from which each holds; one holds from 0 h. Each is what might stand in
+    place of the schedule. period: hours after which the values begin again; None: the last value
+    stays.
 
-    The medium takes the value that holds as a step begins. In rates and rules,
-    `schedule(cell.time)` is the value at a time: rates have that of the middle of a step, rules
-    that of its beginning.
+    A medium takes one in place of a source, a flow, a reservoir or the value at a face, with the
+    value that holds as a step begins. A circuit takes one as a constant: `p.light` of
+    `Circuit(…, light=schedule)` has the value of the middle of a step. In rules,
+    `schedule(cells.time)` is that of its beginning.
     """
 
     values: Mapping[float, Any]
@@ -73,20 +76,44 @@ class Schedule(metaclass=checks.KnownKeywords):
         return self.values[self.times[self.place(time)]]
 
     def __call__(self, time: Any) -> Any:
-        """The value at a time, h, as rates and rules have it: a number, or a tensor."""
+        """The value at a time, h; an array of them for an array or list of times."""
         if isinstance(time, Real):
             return self.at(float(time))
-        for value in self.values.values():
-            if isinstance(value, (tuple, list)) or not hasattr(value, "__add__"):
-                raise checks.input_error(
-                    "value of a Schedule in rates and rules", value, "a number, or a column"
-                )
-        after = time + ROUNDING
-        after = after if self.period is None else after % self.period
-        found = self.values[0.0] + 0.0 * time  # in the type of the time
-        for start in self.times[1:]:
-            found = torch.where(after >= start, self.values[start] + 0.0 * time, found)
-        return found
+        if isinstance(time, (list, tuple, np.ndarray)):
+            each = np.asarray(time, dtype=float)
+            return np.array([self.at(float(t)) for t in each.flat]).reshape(each.shape)
+        raise checks.InputError(
+            f"a Schedule was called with {type(time).__name__}: it takes a time, h, as rules have"
+            " it. Rates take it as a constant: tf.Circuit(…, light=schedule), which they read as"
+            " p.light."
+        )
+
+    def warn_of_step(self, what: str, dt: float, late: float = 0.0) -> None:
+        """Warn where steps of dt hours, each with the value that holds `late` of a step after its
+        beginning, do not follow the changes of `what`."""
+        if lost := self._lost(dt, late):
+            warn(
+                f"{what} has the value of {', '.join(f'{t:g} h' for t in lost)} in no step of"
+                f" {dt:g} h: it is lost. Take a shorter dt, of which the times are multiples."
+            )
+            return
+        moments = (*self.times, self.period or 0.0)
+        between = [t for t in moments if abs(t / dt - round(t / dt)) > 1e-6]
+        if between:
+            warn(
+                f"{what} changes at {between[0]:g} h, within a step of {dt:g} h. A step takes one"
+                " value, so that values hold for longer or shorter than they should. Let the"
+                " times, and the period, be multiples of dt."
+            )
+
+    def _lost(self, dt: float, late: float) -> list[float]:
+        """The times whose values no step of the first period takes, or of as long as it changes."""
+        end = self.times[-1] + 2 * dt if self.period is None else self.period
+        steps = int(end / dt - late + ROUNDING) + 1
+        if steps < len(self.times) or steps < MOST_LOOKED_AT:
+            seen = {self.place((k + late) * dt) for k in range(steps)}
+            return [t for k, t in enumerate(self.times) if k not in seen]
+        return []
 
     @property
     def told(self) -> str:
