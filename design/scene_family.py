@@ -174,7 +174,7 @@ def try_scenes(
             raise _cannot_be_built(error, values, trials[0]) from error
         target.check(tried.first)
         example = example or family.scene([values])
-        made_of.append((scene.effects, scene.founders))
+        made_of.append((scene.effects, scene.drawn_from))
         stochastic |= _is_stochastic(scene)
         endless.append(tried.why_endless)
         rough.append(why_rough(scene, tried.why_regrown) or target.why_rough(tried.first))

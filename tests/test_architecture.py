@@ -64,6 +64,7 @@ ROOMS = {
             "torchfilm.turns",
             "torchfilm.together",
             "torchfilm.binding_checks",
+            "torchfilm.founders",
             "torchfilm.initial_cells",
             "torchfilm.inocula",
             "torchfilm.micrographs",

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -22,6 +21,7 @@ from torch import Tensor
 
 from torchfilm import binding_checks
 from torchfilm.effect import BUILT_IN, DIVISION, FLAGGED_DIVISION, Binding, BoundEffect
+from torchfilm.founders import FirstCells
 from torchfilm.initial_cells import Cells
 from torchfilm.joined_step import JoinedStep, joined
 from torchfilm.parameters import parameters
@@ -42,16 +42,6 @@ if TYPE_CHECKING:
     from torchfilm.scene import Scene
 
 
-@dataclass(frozen=True)
-class _Start:
-    """From what a batch starts: seed, streams (B,) or None, and its first cells."""
-
-    colonies: int
-    seed: int
-    streams: Tensor | None
-    cells: Cells
-
-
 class Model:
     """A scene bound to a batch. Made by `scene.bind(…)`.
 
@@ -63,7 +53,7 @@ class Model:
     """
 
     def __init__(
-        self, scene: Scene, batch: BoundBatch, start: _Start, only: Collection[int] | None
+        self, scene: Scene, batch: BoundBatch, start: FirstCells, only: Collection[int] | None
     ):
         self.scene, self.batch, self.dt, self.dim = scene, batch, scene.dt, scene.dim
         self._begin, self.seed = start, start.seed
@@ -296,7 +286,7 @@ class Model:
     def growth_fingerprint(self) -> str:
         """A word that is equal for models that grow alike, and for no others."""
         recorded = [self.scene.effects[k] for k in self.recorded]
-        return digest(recorded, self.scene.founders, self.dim)
+        return digest(recorded, self.scene.drawn_from, self.dim)
 
     @cached_property
     def why_not_replayable(self) -> str:
@@ -367,7 +357,8 @@ def bind(
     if founders.dim != scene.dim:
         raise checks.input_error("cells", f"{founders.dim}-D", f"{scene.dim}-D, as the scene is")
     batch = BoundBatch(count, dtype, checks.device(device), _types(founders), per_colony)
-    model = Model(scene, batch, _Start(count, seed, _streams(streams, count), founders), only)
+    start = FirstCells(count, seed, _streams(streams, count), scene, cells)
+    model = Model(scene, batch, start, only)
     first = model.trace(None)
     if only is None:  # a part of a scene lacks what the rest of it declares
         binding_checks.check_names(model.effects, scene.declared_by, first)
@@ -388,7 +379,7 @@ def _bind_to_state(scene: Scene, state: State, only: Collection[int] | None) -> 
     batch = BoundBatch(count, state.dtype, state.device, _types(scene.founders), per_colony=True)
     # by colony id: the places may be others
     streams = torch.arange(count, device=state.device).index_copy(0, state.colony_id, state.stream)
-    model = Model(scene, batch, _Start(count, state.seed, streams, scene.founders), only)
+    model = Model(scene, batch, FirstCells(count, state.seed, streams, scene, None), only)
     model.check(state)
     # what it can be tried on: cells that there are, or else the founders
     tried = model.trace(model.opened(state) if state.cells else None)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchfilm.circuits.names import without_medium
 from torchfilm.effect import BUILT_IN, Effect
+from torchfilm.founders import Draw, one_draw
 from torchfilm.initial_cells import Cells
 from torchfilm.model import Model, bind
 from torchfilm.parameters import given, parameters, summary
@@ -32,9 +33,11 @@ class Scene(metaclass=checks.KnownKeywords):
     one.
 
     name: for results. dt: default step, h. founders: cells that each colony starts from; by default
-    one cell, 2 µm long. dim: 2 or 3, for a scene without mechanics. recipe: (name, parameters) of a
-    ready-made scene, from which `resume` builds it again. settings: what the user's own scene
-    function was given. accuracy: accuracy settings applied so far.
+    one cell, 2 µm long; or a function from a seed to such cells, which is called for each colony
+    with a seed of its stream: `founders=lambda seed: tf.inoculum(12, 10.0, seed=seed)`. dim: 2 or
+    3, for a scene without mechanics. recipe: (name, parameters) of a ready-made scene, from which
+    `resume` builds it again. settings: what the user's own scene function was given. accuracy:
+    accuracy settings applied so far.
 
     `code`: versions of Python and torchfilm, and a digest of the effects, what their functions
     compute included. A rules file is known by its path, since it may change during a run.
@@ -44,7 +47,8 @@ class Scene(metaclass=checks.KnownKeywords):
     name: str
     dt: float
     dim: int
-    founders: Cells
+    founders: Cells  # where they are drawn, those of the seed 0
+    draw: Draw | None
     recipe: tuple[str, dict[str, Any]] | None
     settings: dict[str, Any]
     accuracy: dict[str, float]
@@ -60,7 +64,7 @@ class Scene(metaclass=checks.KnownKeywords):
         *effects: Effect,
         name: str = "scene",
         dt: float = 0.025,
-        founders: Cells | None = None,
+        founders: Cells | Draw | None = None,
         dim: int | None = None,
         recipe: tuple[str, dict[str, Any]] | None = None,
         settings: dict[str, Any] | None = None,
@@ -75,7 +79,13 @@ class Scene(metaclass=checks.KnownKeywords):
             "accuracy": dict(accuracy or {}),
             "_given": {"founders": founders, "dim": dim},
             "dt": checks.number("Scene.dt", dt, above=0.0),
+            "draw": None,
         }
+        if founders is not None and not isinstance(founders, Cells):
+            if not callable(founders):
+                rule = "Cells, or a function from a seed to Cells"
+                raise checks.input_error("Scene.founders", founders, rule)
+            made["draw"], founders = founders, one_draw(founders, 0)
         made["dim"] = _dimension(effects, founders, dim)
         made["founders"] = founders if founders is not None else Cells.single(made["dim"])
         if made["founders"].dim != made["dim"]:
@@ -112,7 +122,12 @@ class Scene(metaclass=checks.KnownKeywords):
     @property
     def fingerprint(self) -> str:
         """A hexadecimal word, equal for scenes that simulate the same."""
-        return digest(self.effects, self.founders, self.dim, self.dt, self.name)
+        return digest(self.effects, self.drawn_from, self.dim, self.dt, self.name)
+
+    @property
+    def drawn_from(self) -> Any:
+        """What decides the founders: they themselves, or they and the function that draws them."""
+        return self.founders if self.draw is None else (self.founders, self.draw)
 
     def replace(self, *effects: Effect, **changes: Any) -> Scene:
         """The same scene with other effects, if any are given, or with another name, dt, founders,
@@ -122,6 +137,7 @@ class Scene(metaclass=checks.KnownKeywords):
                 known = ("*effects", *CHANGEABLE)
                 raise checks.unknown_keyword("Scene.replace", name, known, NO_KEYWORD)
         kept: dict[str, Any] = {name: getattr(self, name) for name in CHANGEABLE}
+        kept["founders"] = self.draw or self.founders
         if any(getattr(e, "dim", self.dim) != self.dim for e in effects):
             # they decide what was not given
             kept |= self._given
@@ -187,7 +203,9 @@ class Scene(metaclass=checks.KnownKeywords):
     @property
     def headline(self) -> str:
         """Name, dimension, step and founders, in a line."""
-        return f"{self.name}: {self.dim}-D, step {self.dt:g} h, {self.founders.count} founder(s)"
+        drawn = "" if self.draw is None else ", drawn for each colony"
+        about = f"{self.name}: {self.dim}-D, step {self.dt:g} h"
+        return f"{about}, {self.founders.count} founder(s){drawn}"
 
     def __repr__(self) -> str:
         return f"Scene({', '.join(summary(e) for e in self.effects)}, name={self.name!r})"
