@@ -240,6 +240,9 @@ def labelled() -> tf.State:
 def test_strains_and_heterozygosity():
     state = labelled()
     found = tf.measure.strains(state)
+    wanted = tf.measure.strains(state, kinds=[*found, 77])
+    assert all(torch.equal(wanted[k], found[k]) for k in found)
+    assert wanted[77].tolist() == [0] * state.colonies
     assert {k: v.tolist() for k, v in found.items()} == {
         0: [2, 0, 0], 1: [1, 3, 0], 4: [1, 0, 0],
     }  # fmt: skip

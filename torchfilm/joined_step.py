@@ -85,4 +85,4 @@ def joined(
 
 def _grows_plainly(effect: Effect) -> bool:
     """Whether the field growth_rate alone tells how cells grow. Subclasses may do as they like."""
-    return type(effect) is Growth and not effect.sets_rate
+    return type(effect) is Growth and effect.is_plain

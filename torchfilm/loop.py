@@ -125,6 +125,12 @@ def handle_failures(state: State, on_failure: str) -> State:
             + '; on_failure="drop" continues without them.',
             [int(state.colony_id[p]) for p in places],
         )
+    for f in found:
+        warn(
+            f"colony {f.colony_id} ({f.cells} cells) failed in step {state.step} (t ="
+            f" {state.time:g} h), and the run goes on without its cells: {f.reason}",
+            category=RuntimeWarning,
+        )
     return state.remove(
         torch.isin(state.colony, torch.tensor(places, device=state.device)), "failed"
     )

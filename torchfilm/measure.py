@@ -214,12 +214,18 @@ def tilt(state: State) -> Tensor:
 
 @of_a_state
 @torch.no_grad()
-def strains(state: State, name: str = "cell_type") -> dict[int, Tensor]:
+def strains(
+    state: State, name: str = "cell_type", *, kinds: Sequence[int] | None = None
+) -> dict[int, Tensor]:
     """How many cells of each kind a colony has: (B,) int64 by the values of a field of whole
-    numbers, such as the cell type or a neutral label that daughters inherit."""
+    numbers, such as the cell type or a neutral label that daughters inherit. kinds: of which to
+    tell; None: of all that some colony has, so that one that has died out everywhere is not
+    among them."""
     kind = _kinds("strains", state, name)
     count = lambda k: torch.bincount(state.colony[kind == k], minlength=state.colonies)
-    return {int(k): count(k) for k in kind.unique().tolist()}
+    if kinds is None:
+        kinds = [int(k) for k in kind.unique().tolist()]
+    return {checks.integer("kinds", k, least=0): count(k) for k in kinds}
 
 
 @of_a_state

@@ -378,3 +378,72 @@ def test_a_rate_that_the_first_cells_override_is_warned_of(rate, warned):
         warnings.simplefilter("always")
         tf.Scene(tf.Growth(rate=rate), founders=cells, dim=2)
     assert any("has no effect: the first cells have" in str(w.message) for w in caught) == warned
+
+
+# --- a factor -------------------------------------------------------------------------------------
+
+
+def slowed(cells):
+    cells.vigour = torch.where(cells.cell_type == 1, 0.5, 1.0)
+
+
+def pair(*effects: tf.Effect) -> tf.Scene:
+    cells = tf.Cells([[0.0, 0.0], [9.0, 0.0]], [[1.0, 0.0]] * 2, cell_type=[0, 1])
+    return tf.Scene(*effects, founders=cells)
+
+
+@pytest.mark.parametrize("rate", [1.2, {0: 1.2, 1: 0.8}, tf.Uniform(1.1, 1.3)])
+@pytest.mark.parametrize("contacts", [True, False])
+def test_a_factor_multiplies_the_rate(rate, contacts):
+    more = [tf.Mechanics(dim=2)] if contacts else []
+    rules = tf.Rules(slowed, variables={"vigour": 1.0})
+    model = pair(tf.Growth(rate=rate, factor="vigour"), rules, *more).bind(dtype=torch.float64)
+    first = state = model.start()
+    for _ in range(40):
+        state = model.step(state)
+    kept = model.step(model.start()).growth_rate  # a rate by type is there from the first step on
+    expected = (kept * torch.tensor([1.0, 0.5])).exp()
+    assert torch.allclose(state.volume / first.volume, expected, rtol=1e-9)
+    assert torch.equal(state.growth_rate, kept)
+
+
+def test_a_circuit_stops_growth():
+    """Of cells that have a toxin: exp(−t) of the rate is left after t hours, so ln V grows by
+    1 − exp(−t)."""
+    rates = lambda u, s, p, cell: {"left": -u.left}
+    circuit = tf.Circuit(rates, species="left", initial={"left": 1.0}, dilution=False)
+    scene = tf.Scene(tf.Growth(rate=1.0, factor="left"), circuit, founders=one_cell(), dt=0.01)
+    *_, end = tf.simulate(scene, until=2.0)
+    first = scene.bind().start()
+    gained = math.log(float(end.volume) / float(first.volume))
+    assert gained == pytest.approx(1 - math.exp(-2.0), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("build", "said"),
+    [
+        (lambda: tf.Growth(rate=1.0, factor=2.0), r"Growth.factor = 2.0 .*name of a variable"),
+        (
+            lambda: tf.Growth(species="a", factor="b"),
+            r"Growth.factor = 'b' .*left out with species",
+        ),
+        (
+            lambda: pair(tf.Growth(rate=1.0, factor="vigor")).bind().start(),
+            r"Growth.factor = 'vigor' .*a species of a circuit, or a variable .*There are: ",
+        ),
+        (
+            lambda: (
+                pair(
+                    tf.Growth(rate=1.0, factor="vigour"),
+                    tf.Rules(slowed, variables={"vigour": -1.0}),
+                )
+                .bind()
+                .start()
+            ),
+            r"Growth.factor: vigour of a first cell is below 0",
+        ),
+    ],
+)
+def test_a_factor_that_is_refused(build, said):
+    with pytest.raises(tf.InputError, match=said):
+        build()

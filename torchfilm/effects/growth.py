@@ -58,6 +58,9 @@ class Growth(Effect):
     species · V, exactly. So a circuit may live on several nutrients and pay for growth. The law is
     "volume".
 
+    factor: the name of a variable of the cells, such as rules set or circuits compute, that
+    multiplies the rate: what slows cells down, or stops them. `growth_rate` stays as it is.
+
     The number of cells doubles more slowly. A division at the length l makes two new caps of radius
     r, so that daughters begin at (l − 2r)/2: by "volume" they divide again after ln((l + 4r/3)/(l/2
     + r/3))/rate, by "length" after ln(2l/(l − 2r))/rate. With l = 4 µm and r = 0.5 µm that is
@@ -67,6 +70,7 @@ class Growth(Effect):
     rate: Value | None = physical(None, unit="1/h", least=0.0, drawn_by_effect=True)
     law: str = "volume"
     species: str | None = None
+    factor: str | None = None
 
     stage = GROWTH
     title = "growth"
@@ -75,6 +79,10 @@ class Growth(Effect):
 
     def __post_init__(self) -> None:
         checks.choice("Growth.law", self.law, LAWS)
+        named = isinstance(self.factor, str) and self.factor.isidentifier()
+        if self.factor is not None and (not named or self.species is not None):
+            rule = "left out with species" if named else "the name of a variable of the cells"
+            raise checks.input_error("Growth.factor", self.factor, rule)
         if self.species is None:
             return
         if not (isinstance(self.species, str) and self.species.isidentifier()):
@@ -110,18 +118,26 @@ class Growth(Effect):
         return {"rate": "growth_rate"}
 
     def at_least_zero(self) -> tuple[str, ...]:
-        return ("growth_rate", *self._paid())
+        return ("growth_rate", *self._paid(), *self._slowed())
 
     def _paid(self) -> tuple[str, ...]:
         return () if self.species is None else (self.species,)
+
+    def _slowed(self) -> tuple[str, ...]:
+        return () if self.factor is None else (self.factor,)
 
     @property
     def sets_rate(self) -> bool:
         """Whether it sets growth_rate in each step."""
         return self.by_type or self.species is not None
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether growth_rate is all that it goes by."""
+        return not self.sets_rate and self.factor is None
+
     def reads(self) -> tuple[str, ...]:
-        return (*(self._paid() or ("growth_rate",)), "length", "radius")
+        return (*(self._paid() or ("growth_rate",)), "length", "radius", *self._slowed())
 
     def waits_for(self) -> Mapping[str, str]:
         if self.species is not None:
@@ -168,14 +184,18 @@ class Growth(Effect):
                 )
 
     def check(self, state: State, values: Values) -> None:
-        for name in self._paid():
-            declared = state.declared.get(name)
-            if declared is None or declared.scope != CELL or declared.shape:
-                there = [n for n, f in state.declared.items() if f.scope == CELL and not f.shape]
-                rule = "a species of a circuit, or a variable with one number for each cell"
-                raise checks.input_error(
-                    "Growth.species", name, rule, f"There are: {', '.join(there)}."
-                )
+        for option, names in (("species", self._paid()), ("factor", self._slowed())):
+            for name in names:
+                declared = state.declared.get(name)
+                if declared is None or declared.scope != CELL or declared.shape:
+                    there = [n for n, f in state.declared.items() if f.scope == CELL]
+                    rule = "a species of a circuit, or a variable with one number for each cell"
+                    hint = f"There are: {', '.join(there)}."
+                    raise checks.input_error(f"Growth.{option}", name, rule, hint)
+                if bool((~(state.fields[name] >= 0)).any()):
+                    raise checks.InputError(
+                        f"Growth.{option}: {name} of a first cell is below 0; it must be 0 or more."
+                    )
 
     def check_step(self, dt: float, divides: bool) -> None:
         if self.rate is None or not divides or self.law == "linear":
@@ -204,7 +224,8 @@ class Growth(Effect):
                 growth_rate=(torch.log1p(paid) / dt).to(state.growth_rate.dtype),
                 **{self.species: torch.zeros_like(paid)},
             )
-        relative = state.growth_rate * dt
+        rate = state.growth_rate
+        relative = (rate if self.factor is None else rate * state.fields[self.factor]) * dt
         if self.law != "linear":
             relative = torch.expm1(relative)
         elongation = wanted_elongation(self.law, relative, state.length, state.radius)
