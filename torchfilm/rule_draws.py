@@ -54,6 +54,14 @@ class Draws:
         return binomial(count, _probability("binomial", probability, drawn), drawn)
 
 
+class OneCell(Draws):
+    """What a loop over cells draws for one of them: its numbers do not depend on the others."""
+
+    def __init__(self, cells: Draws, index: int):
+        self._state, self._draws, self._purpose = cells._state, 0, f"{cells._purpose} one by one"
+        self._rows = torch.tensor([index], device=cells._state.device)
+
+
 def _column(what: str, value: Any, like: Tensor) -> Tensor:
     given = as_tensor(what, value, like.device).detach().to(like.dtype)
     if given.shape not in ((), like.shape):

@@ -6,7 +6,7 @@ Rules may read every name, and write those that the model allows.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchfilm.circuits.names import Names
 from torchfilm.physics.contacts import gaps_nearby
-from torchfilm.rule_draws import Draws
+from torchfilm.rule_draws import Draws, OneCell
 from torchfilm.rule_values import RuleError, as_tensor, broadcast_copy, check_integers, real_column
 from torchfilm.state import CELL, CELL_TYPE, COLONY, OUTSIDE, Field, State
 from torchfilm.tools import checks
@@ -42,6 +42,8 @@ IDENTITY = ("uid", "parent", "colony")
 OF_EFFECTS = {"growth_rate": "tf.Growth()", "divide_flag": "tf.Division()"}
 SECRETES = "a circuit says what cells give to a signal and take from it"
 ONE_BY_ONE = ("random", "chance", "binomial")
+# How a view finds the constants that rules were given, its `p`; None: they were given none.
+Constants = Callable[[], Names] | None
 KNOWN_FIELDS = {
     "cell_type": CELL_TYPE,
     "drag": Field("drag", "factor on the viscosity that this cell feels", initial=1.0),
@@ -77,7 +79,8 @@ class CellsView(Draws):
     """The cells as a rule sees them: every name is a tensor over all cells, (N,) or (N, d).
 
     `for cell in cells` gives them one by one (slow). A rule may read position (pos), axis (dir),
-    length, radius, volume, area, uid, parent, colony, signals, and every field of the scene. It may
+    length, radius, volume, area, uid, parent, colony, signals, the constants p that its rules were
+    given, and every field of the scene. It may
     write fields, `divide_flag`, `remove_flag`, and new names, which become variables of the cell. A
     tensor that was read may be changed in place.
     """
@@ -91,8 +94,16 @@ class CellsView(Draws):
     _declaring: bool
     _draws: int
     _draws_of: dict[int, OneCell]
+    _constants: Constants
 
-    def __init__(self, state: State, dt: float, label: str, declaring: bool = False):
+    def __init__(
+        self,
+        state: State,
+        dt: float,
+        label: str,
+        declaring: bool = False,
+        constants: Constants = None,
+    ):
         # bypasses __setattr__, which is for rules
         self.__dict__.update(
             _state=state,
@@ -106,6 +117,7 @@ class CellsView(Draws):
             _declaring=declaring,
             _draws=0,
             _draws_of={},
+            _constants=constants,
         )
 
     @property
@@ -134,6 +146,8 @@ class CellsView(Draws):
             return self._work[name]
         if name == "signals":
             return self._signals()
+        if name == "p" and self._constants is not None:
+            return self._constants()
         state = self._state
         if name in GEOMETRY or name in IDENTITY:
             self._read.update(MEANS.get(name, (name,)))
@@ -276,14 +290,6 @@ class CellsView(Draws):
         return torch.bincount(torch.cat([i, j]), minlength=self._state.cells)
 
 
-class OneCell(Draws):
-    """What a loop over cells draws for one of them: its numbers do not depend on the others."""
-
-    def __init__(self, cells: CellsView, index: int):
-        self._state, self._draws, self._purpose = cells._state, 0, f"{cells._purpose} one by one"
-        self._rows = torch.tensor([index], device=cells._state.device)
-
-
 class CellView:
     """One cell of a CellsView: the same names, one value each.
 
@@ -300,9 +306,9 @@ class CellView:
         if name.startswith("_"):
             raise AttributeError(name)
         found = getattr(self._cells, name)
-        if name == "signals":
+        if isinstance(found, Names):
             one = [found[n][self._index] for n in found]
-            return Names(tuple(found), one, "cell.signals", SECRETES)
+            return Names(tuple(found), one, f"cell.{name}", found.why)
         if name in ONE_BY_ONE:
             drawn = self._cells._draws_of.setdefault(self._index, OneCell(self._cells, self._index))
             return lambda *given: getattr(drawn, name)(*given)[0]
@@ -342,16 +348,22 @@ class DivisionView(Draws):
     _set: set[str]
     _work: dict[str, Tensor]
     _draws: int
+    _constants: Constants
 
-    def __init__(self, state: State, rows: Tensor | None, called: str, purpose: str):
+    def __init__(
+        self, state: State, rows: Tensor | None, called: str, purpose: str, constants: Constants
+    ):
         self.__dict__.update(
-            _state=state, _rows=rows, _name=called, _purpose=purpose, _set=set(), _work={}, _draws=0
-        )
+            _state=state, _rows=rows, _name=called, _purpose=purpose, _set=set(), _work={},
+            _draws=0, _constants=constants,
+        )  # fmt: skip
 
-    def __getattr__(self, name: str) -> Tensor:
+    def __getattr__(self, name: str) -> Any:
         name = PAPER_NAMES.get(name, name)
         if name.startswith("_"):
             raise AttributeError(name)
+        if name == "p" and self._constants is not None:
+            return self._constants()
         if name not in self._work:
             if not (name in GEOMETRY or name in IDENTITY or name in self._state.fields):
                 known = _known_names(self._state)

@@ -41,7 +41,7 @@ class DivisionRule(BoundRule):
         twice = state.take(torch.cat([one, one]))
         births = Births(one, one + 1, torch.cat([one, one]), state, one)
         with own_draws(label_of(divide)):
-            views = _after_divide(divide, twice, births)
+            views = _after_divide(divide, self, twice, births)
         self.traced_reads = tuple(sorted(_read(views)))
         self.traced_writes = tuple(sorted(_written_in_daughters(views, in_place=True)))
         return state
@@ -53,7 +53,7 @@ class DivisionRule(BoundRule):
         return state
 
     def _divide(self, divide: Callable[..., None], state: State, births: Births) -> State:
-        views = _after_divide(divide, state, births)
+        views = _after_divide(divide, self, state, births)
         daughters = views[1:]
         # as in `_apply`, what is changed in place is compared only after an edit
         written = _written_in_daughters(views, in_place=not self.source.proven)
@@ -88,14 +88,19 @@ def _read(views: Sequence[DivisionView]) -> set[str]:
 
 
 def _after_divide(
-    divide: Callable[..., None], state: State, births: Births
+    divide: Callable[..., None], rule: DivisionRule, state: State, births: Births
 ) -> tuple[DivisionView, DivisionView, DivisionView]:
     """The views of parent, first and second daughter, after the rule."""
     label = label_of(divide)  # two rules draw numbers of their own
+
+    def view(state: State, rows: Tensor | None, called: str, which: str) -> DivisionView:
+        purpose = f"{label} divide {which}"
+        return DivisionView(state, rows, called, purpose, rule.constants(state, rows))
+
     views = (
-        DivisionView(births.parents, None, "parent", f"{label} divide parent"),
-        DivisionView(state, births.first, "daughter1", f"{label} divide first"),
-        DivisionView(state, births.second, "daughter2", f"{label} divide second"),
+        view(births.parents, None, "parent", "parent"),
+        view(state, births.first, "daughter1", "first"),
+        view(state, births.second, "daughter2", "second"),
     )
     act(divide, *views)
     return views

@@ -20,9 +20,10 @@ import torch
 from torch import Tensor
 
 from torchfilm.cell_types import kept_by_type, with_values_of_new_types
+from torchfilm.circuits.names import Names
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.rule_values import RuleError, warn_of_mixing
-from torchfilm.rule_views import KNOWN_FIELDS, CellsView, DivisionView
+from torchfilm.rule_views import KNOWN_FIELDS, CellsView, Constants, DivisionView
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import HotReload
@@ -85,6 +86,23 @@ class BoundRule(BoundEffect):
 
     def writes(self) -> tuple[str, ...]:
         return self.traced_writes
+
+    def constants(self, state: State, rows: Tensor | None = None) -> Constants:
+        """What rules find as `p` of all cells, or of the cells `rows` (M,)."""
+        names = tuple(self.effect.parameters)
+        if not names:
+            return None
+
+        def find() -> Names:
+            count = state.cells if rows is None else rows.numel()
+            each = [
+                value.of_cells(state) if rows is None else value.of_rows(state, rows)
+                for value in (self.values[n] for n in names)
+            ]
+            columns = [x.expand(count).clone() for x in each]  # a rule may change them in place
+            return Names(names, columns, "cells.p", "constants stay as they are")
+
+        return find
 
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         self.others = effects
@@ -229,7 +247,9 @@ class BoundRules(BoundRule):
         twice = state.cells == 1 and "divide_flag" in state.fields
         both = torch.zeros(2, dtype=torch.int64, device=state.device)
         tried = state.take(both) if twice else state
-        view = CellsView(tried, TRIAL_STEP, label_of(update), declaring=True)
+        view = CellsView(
+            tried, TRIAL_STEP, label_of(update), declaring=True, constants=self.constants(tried)
+        )
         try:
             with own_draws(label_of(update)):
                 act(update, view)
@@ -246,8 +266,15 @@ class BoundRules(BoundRule):
         self.traced_reads = tuple(sorted(view._read))
         self.traced_writes = tuple(_written(view, tried))
         state = self.ready(state)
-        warn_of_mixing(label_of(update), partial(_columns, update), state)
+        warn_of_mixing(label_of(update), partial(self._columns, update), state)
         return state
+
+    def _columns(self, update: Callable[[CellsView], None], state: State) -> dict[str, Tensor]:
+        """What a rule writes in a trial."""
+        constants = self.constants(state)
+        view = CellsView(state, TRIAL_STEP, label_of(update), declaring=True, constants=constants)
+        act(update, view)
+        return dict(view._work)
 
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0:
@@ -256,7 +283,7 @@ class BoundRules(BoundRule):
         return self.source.call("update", partial(self._apply, state, dt), state)
 
     def _apply(self, state: State, dt: float, update: Callable[[CellsView], None]) -> State:
-        view = CellsView(state, dt, label_of(update))
+        view = CellsView(state, dt, label_of(update), constants=self.constants(state))
         act(update, view)
         work = dict(view._work)
         gone = work.pop("remove_flag", None)
@@ -278,13 +305,6 @@ class BoundRules(BoundRule):
             gone = None if gone is None else gone & ~kept
         state = self.given(state, work)
         return state if gone is None else state.remove(gone, "removed")
-
-
-def _columns(update: Callable[[CellsView], None], state: State) -> dict[str, Tensor]:
-    """What a rule writes in a trial."""
-    view = CellsView(state, TRIAL_STEP, label_of(update), declaring=True)
-    act(update, view)
-    return dict(view._work)
 
 
 def _written(view: CellsView, state: State) -> list[str]:

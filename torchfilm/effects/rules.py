@@ -21,10 +21,14 @@ from typing import Any
 from torchfilm.effect import RULES, Binding, BoundEffect, Effect
 from torchfilm.effects.bound_division_rule import DivisionRule
 from torchfilm.effects.bound_rules import MEANING, BoundRules
+from torchfilm.resolver import Values
 from torchfilm.rule_views import OF_EFFECTS, CellsView, DivisionView
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import HotReload, edited, load_functions
+from torchfilm.values import Rule, Value, checked
+
+CONSTANT = Rule(scheduled=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +37,15 @@ class Rules(Effect):
     daughter2)` after divisions.
 
     update: a function, or the path of a Python file that defines `update` and optionally `divide`.
-    variables: initial values of the user's own variables, one number each.
+    variables: initial values of the user's own variables, one number each. parameters: constants
+    that rules read as `cells.p.k` (`parent.p.k`, …), one value for each cell: a number, one per
+    colony, one per cell type, a distribution drawn at birth, or a Schedule.
     """
 
     update: Callable[[CellsView], None] | str | Path | None = None
     divide: Callable[[DivisionView, DivisionView, DivisionView], None] | None = None
     variables: Mapping[str, float] = field(default_factory=dict)
+    parameters: Mapping[str, Value] = field(default_factory=dict)
     path: Path | None = field(init=False, repr=False)
     functions: dict[str, Any] = field(init=False, repr=False)
     stamp: tuple[int, int] = field(init=False, repr=False)  # of the file as it was loaded
@@ -79,13 +86,30 @@ class Rules(Effect):
                     f"left to {OF_EFFECTS[name]}, which has it: list that beside Rules",
                 )
             checks.number(f"Rules.variables[{name!r}]", value)
+        if not isinstance(self.parameters, Mapping):
+            raise checks.input_error("Rules.parameters", self.parameters, 'a dict, {"k": 2.0}')
+        for name in self.parameters:
+            if not (isinstance(name, str) and name.isidentifier()):
+                raise checks.input_error("Rules.parameters", name, "a name, such as 'k'")
+        constants = {n: checked(f"Rules.{n}", v, CONSTANT) for n, v in self.parameters.items()}
+        object.__setattr__(self, "parameters", constants)
         object.__setattr__(self, "path", path)
         object.__setattr__(self, "functions", functions)
         object.__setattr__(self, "stamp", stamp)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # unpickling reads a rules file again
-        return (Rules, (self.update, self.divide, dict(self.variables)))
+        return (Rules, (self.update, self.divide, dict(self.variables), dict(self.parameters)))
+
+    def physical_values(self) -> dict[str, tuple[Any, Rule]]:
+        return {name: (value, CONSTANT) for name, value in self.parameters.items()}
+
+    def check(self, state: State, values: Values) -> None:
+        if self.parameters and "p" in state.fields:
+            raise checks.InputError(
+                "Rules.parameters are what rules read as cells.p, but the cells have a field 'p':"
+                " rename the field."
+            )
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return tuple(Field(name, MEANING, initial=value) for name, value in self.variables.items())
