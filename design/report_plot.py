@@ -112,10 +112,11 @@ def _colour(name: str, place: int) -> str:
 
 
 def _limits(target: Target, frames: list[dict[str, np.ndarray]]) -> dict[str, tuple[float, float]]:
-    """The range of colours of each species that the target reads in cells: that of these frames.
-    One for both designs, so that these can be compared."""
+    """The range of colours of each species that the target reads in cells: that of these frames,
+    and up to what the target calls lit. One for both designs, so that these can be compared."""
     names = [n for n in target.names if not n.startswith("out.")]
-    return {n: (0.0, max((float(f[n].max()) for f in frames), default=1.0) or 1.0) for n in names}
+    high = {n: max((float(f[n].max()) for f in frames), default=1.0) for n in names}
+    return {n: (0.0, max(high[n], target.lit_from.get(n, 0.0)) or 1.0) for n in names}
 
 
 def _draw_row(

@@ -110,6 +110,12 @@ class Target(metaclass=checks.KnownKeywords):
         return ""
 
     @property
+    def lit_from(self) -> dict[str, float]:
+        """The level from which a cell counts as lit, by species, where the target has one: the
+        range of colours of pictures reaches it, so that dark cells look dark."""
+        return {}
+
+    @property
     def bounds(self) -> dict[str, str]:
         """The constraints on measures, such as "≥ 10", where the target has some."""
         return {}

@@ -131,6 +131,10 @@ class Lasting(Target):
         return self.target.anywhere
 
     @property
+    def lit_from(self) -> dict[str, float]:
+        return self.target.lit_from
+
+    @property
     def bounds(self) -> dict[str, str]:
         return self.target.bounds
 

@@ -21,7 +21,7 @@ from design.targets.base import (
     valid_levels,
     weights,
 )
-from design.targets.patterns import FOUND, TARGET
+from design.targets.patterns import TARGET
 from torchfilm import checks
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ STEADY = 1e-12  # variance, in mean squares of the level, that rounding can caus
 SLACK = 1e-6  # periods: tolerance, because times are sums of steps
 FINER = 10  # tried frequencies for each one that the window can resolve
 TRIED = 5.0  # periods are tried from the target divided by this to the target times this
+FOUND = "#757575"  # the colour of the mean that was found
 
 
 @dataclass(frozen=True)

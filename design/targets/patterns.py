@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 GAP = 0.5  # µm: cells with a smaller gap are neighbours
 FEWEST = 1e-12  # a smaller share of unlike neighbours counts as none
 BRIGHTEST = 1e6  # levels, in thresholds, from which a cell is fully on in float64
-TARGET, FOUND = "#c2185b", "#757575"
+TARGET = "#c2185b"
 
 
 @dataclass(frozen=True)
@@ -177,6 +177,10 @@ class OnFraction(Target):
     def names(self) -> tuple[str, ...]:
         return (self.species,)
 
+    @property
+    def lit_from(self) -> dict[str, float]:
+        return {self.species: self.level}
+
     def check(self, state: tf.State) -> None:
         require(state, (self.species,))
 
@@ -216,14 +220,13 @@ class OnFraction(Target):
         return why.get(measure, "")
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        """Draw two bars in a corner: the target share and the share found."""
-        inset = ax.inset_axes((0.02, 0.02, 0.2, 0.2))
+        """Write the share found and the target share below the colony, where they hide nothing."""
         found = float(self.measures(state)["on_share"][place])
-        inset.bar([0, 1], [self.fraction, found], color=[TARGET, FOUND])
-        inset.set_xticks([0, 1], ["target", "found"], fontsize=5.0)
-        # above the bars: below them lies the scale bar of the panel
-        inset.tick_params(axis="x", bottom=False, labelbottom=False, labeltop=True, length=0)
-        inset.set(ylim=(0, 1), yticks=[])
+        ax.annotate(
+            f"{self.species} on: {found:.3g}, target {self.fraction:.3g}", (1, 0),
+            xycoords="axes fraction", xytext=(0, -8), textcoords="offset points", ha="right",
+            va="top", color=TARGET, fontsize=7.0, annotation_clip=False,
+        )  # fmt: skip
 
     def describe(self) -> str:
         return f"{self.species} above {self.level:g} in {self.fraction:.3g} of the cells"

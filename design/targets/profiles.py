@@ -89,6 +89,10 @@ class ProfileTarget(Target):
         raise NotImplementedError(f"{type(self).__name__}.names")
 
     @property
+    def lit_from(self) -> dict[str, float]:
+        return dict.fromkeys(self.names, self.floor) if self.floor else {}
+
+    @property
     def least(self) -> float:
         """A colony in which no cell has m above this does not reach the place of the pattern."""
         return 0.0

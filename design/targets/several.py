@@ -94,6 +94,13 @@ class Several(Target):
         return "; ".join(dict.fromkeys(part.mark for part in self.parts if part.mark))
 
     @property
+    def lit_from(self) -> dict[str, float]:
+        found: dict[str, float] = {}
+        for name, level in (pair for part in self.parts for pair in part.lit_from.items()):
+            found[name] = max(level, found.get(name, level))
+        return found
+
+    @property
     def bounds(self) -> dict[str, str]:
         return {name: bound for part in self.parts for name, bound in part.bounds.items()}
 

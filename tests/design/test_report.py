@@ -16,7 +16,20 @@ from patterned import crowded
 from searching import Level, Spread, banned, built, fragile, lit, uneven
 
 import torchfilm as tf
-from design import Bands, Batch, Choice, Objective, Parameter, Search, Sobol, Stripe, Target, Task
+from design import (
+    Bands,
+    Batch,
+    Choice,
+    Objective,
+    OnFraction,
+    Parameter,
+    Search,
+    Sobol,
+    Stripe,
+    Target,
+    Task,
+    Weighted,
+)
 from design.finals import FreshLosses
 from design.report import table
 from design.report_plot import draw
@@ -259,6 +272,21 @@ def test_both_designs_are_drawn_with_one_scale_of_colours(tmp_path, monkeypatch)
     searched(lit, LIT, Bands(("gfp",), edges=(-2.0, 2.0))).plot(tmp_path / "best.png")
     assert len(seen) == 4 and len(set(levels)) > 1
     assert all(limits == {"gfp": (0.0, max(levels))} for limits in seen)
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        OnFraction("gfp", 0.3, 1e3),
+        Bands(("gfp",), edges=(-2.0, 2.0), floor=1e3),
+        Weighted([(OnFraction("gfp", 0.3, 1e3), 1.0), (Bands(("gfp",), (-2.0, 2.0)), 1.0)]),
+    ],
+)
+def test_colours_reach_what_the_target_calls_lit(target):
+    """So that the best of dark designs does not look lit."""
+    figure = draw(searched(lit, LIT[:1], target)._report())
+    bar = next(ax for ax in figure.axes if ax.get_title() == "gfp (conc)")
+    assert [t.get_text() for t in bar.get_xticklabels()] == ["0", "500", "1000"]
 
 
 def test_trivial_answers_are_reduced_as_the_designs_are():

@@ -206,7 +206,7 @@ def test_what_a_target_says_of_itself_holds_from_a_time_on():
     share = OnFraction("yfp", level=1.0, fraction=0.5)
     for target in (kept, seen, share):
         found = Lasting(target, since=0.5)
-        for name in ("pattern", "anywhere", "bounds", "evidence"):
+        for name in ("pattern", "anywhere", "bounds", "evidence", "lit_from"):
             assert getattr(found, name) == getattr(target, name), (target, name)
     assert (kept.pattern, seen.pattern, share.anywhere) == (True, False, True)
     assert Lasting(kept, since=0.5).bounds == {"burden": "≥ 2"}
