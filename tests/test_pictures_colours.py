@@ -130,6 +130,18 @@ def test_kinds_of_cells_have_a_colour_each():
     ), "twelve are no kinds"
 
 
+def test_a_type_keeps_its_colour_where_others_are_gone():
+    all_types = Drawn(
+        frame([[0, 0], [4, 0], [8, 0], [12, 0]], cell_type=[0, 1, 2, 30]), colour="cell_type"
+    )
+    later = Drawn(frame([[8, 0], [12, 0]], cell_type=[2, 30]), colour="cell_type")
+    for x in (8, 12):
+        assert later.at(x, 0) == pytest.approx(all_types.at(x, 0), abs=NEAR)
+    assert len({tuple(all_types.at(x, 0)) for x in (0, 4, 8, 12)}) == 4
+    legend = [later.layout.scales[0].cmap(k)[:3] for k in (0, 1)]
+    assert np.allclose(legend, [later.at(x, 0) for x in (8, 12)], atol=NEAR)
+
+
 @pytest.mark.parametrize("view, nearest", [("xy", 2), ("xz", 1), ("yz", 0)])
 def test_the_cell_nearest_to_the_eye_hides_the_others(view, nearest):
     """x, y, z are right-handed.

@@ -20,9 +20,10 @@ VECTORS = ("position", "axis")  # three values of a cell that are no colour
 CELLS, MEAN = "cells", "mean"
 # The darkest cell colour is not black, so that cells are visible on black. Missing values are grey.
 FLOOR, NO_VALUE = 0.14, (0.55, 0.55, 0.55, 1.0)
-# An integer quantity with at most this many values is a category, each value with its own colour
-# (of Okabe and Ito, distinct for colour-blind readers).
+# An integer quantity with at most this many values is a category. These are the colours of 0, 1, …
+# (of Okabe and Ito, distinct for colour-blind readers): a type keeps its colour where others die.
 KINDS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#8C6BB1")
+GOLDEN = 0.618034  # of a turn, from one hue to the next: none comes near those before it
 
 # The least range of colours of a concentration, relative to its largest value.
 NARROWEST = 0.01
@@ -272,7 +273,7 @@ def scale_of(
             name,
             label,
             unit,
-            ListedColormap(KINDS[: len(seen.kinds)]),
+            ListedColormap([_colour_of_kind(k) for k in sorted(seen.kinds)]),
             (0.0, 1.0),
             kinds=tuple(sorted(seen.kinds)),
         )
@@ -283,6 +284,15 @@ def scale_of(
     under, over = seen.low < limits[0], seen.high > limits[1]
     beyond: Beyond = "both" if under and over else "min" if under else "max" if over else "neither"
     return Scale(name, label, unit, _colour_map(name, style), limits, beyond)
+
+
+def _colour_of_kind(kind: int) -> Any:
+    """The colour of a category, by its number alone; beyond the list hues far apart."""
+    from matplotlib.colors import hsv_to_rgb
+
+    if 0 <= kind < len(KINDS):
+        return KINDS[kind]
+    return tuple(hsv_to_rgb((kind * GOLDEN % 1.0, 0.6, (0.9, 0.6)[kind % 2])))
 
 
 def _wide_enough(low: float, high: float, share: float) -> tuple[float, float]:
