@@ -89,6 +89,11 @@ def test_colonies_without_cells_are_left_out(scene, tmp_path):
     [
         ({}, r"LivePlot\.out = None .*a script.*notebook needs none"),
         ({"out": "live"}, "ends in .png"),
+        ({"out": "live.txt"}, r"live\.txt.*ends in \.png, \.pdf or \.svg"),
+        ({"out": "a.png", "limits": (0, 1)}, r"limits = \(0, 1\).*ranges by name"),
+        ({"out": "a.png", "colonies": 1}, r"Write colonies=\[1\]"),
+        ({"out": "a.png", "most": "4"}, "most = '4'"),
+        ({"out": "a.png", "dpi": "1"}, "dpi = '1' .*a number"),
         ({"out": "a.png", "seconds": -1.0}, r"LivePlot\.seconds = -1"),
         ({"out": "a.png", "view": "up"}, "view = 'up'"),
         ({"out": "a.png", "channels": {"yfp": "no colour"}}, "no colour"),

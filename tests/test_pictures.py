@@ -287,11 +287,21 @@ def test_the_same_frame_makes_the_same_picture(recorded, tmp_path):
         ({"view": "up"}, r"view.*'up'.*'xy'"),
         ({"view": "xz"}, r"view.*'xz'.*2-D"),
         ({"frame": 99}, r"frame = 99"),
+        ({"limits": (0, 1)}, r"limits = \(0, 1\).*ranges by name"),
+        ({"colour": "length", "limits": [0, 1]}, r'such as \{"length": \(0, 2\)\}'),
+        ({"colonies": 1}, r"colonies = 1 .*Write colonies=\[1\]"),
+        ({"colonies": "1"}, r"colonies = '1' .*a list of"),
+        ({"most": "4"}, r"most = '4' .*a whole number"),
+        ({"title": 3}, "title = 3 .*text"),
+        ({"dpi": "high"}, "dpi = 'high' .*a number"),
+        ({"dpi": -1}, "dpi = -1 .*at least 1"),
     ],
 )
 def test_what_cannot_be_drawn_is_reported(recorded, tmp_path, options, message):
     with pytest.raises(tf.InputError, match=message):
         tf.show(recorded, out=tmp_path / "a.png", **options)
+    with pytest.raises(tf.InputError, match=r"too many.*Write out='a\.png'\."):
+        tf.show(recorded, "a.png")
     assert not (tmp_path / "a.png").exists()
 
 

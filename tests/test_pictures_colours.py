@@ -351,6 +351,7 @@ def test_values_of_ones_own_colour_the_cells(tmp_path):
 @pytest.mark.parametrize(
     ("given", "words"),
     [
+        ({"values": [1.0, 2.0]}, r"values = \[1\.0, 2\.0\].*by name"),
         ({"values": {"a": [1.0]}}, r"values\['a'\].*2 numbers, one a cell"),
         ({"values": {"a": ["x", "y"]}}, r"values\['a'\].*2 numbers"),
         ({"values": {"length": [1.0, 2.0]}}, "other names than the cells have"),

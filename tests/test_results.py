@@ -64,6 +64,13 @@ def test_a_frame_that_is_not_there_is_reported(whole, frame):
         results.frame(frame)
 
 
+def test_a_frame_goes_by_its_number_and_not_by_its_time(whole):
+    with tf.Results(whole[0]) as results:
+        for read in (results.frame, results.cells, results.table, results.state):
+            with pytest.raises(tf.InputError, match=r"no parameter 'time'.*results\.times"):
+                read(time=1.0)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_states_come_back_whole(tmp_path, dtype):
     scene = make_scene()

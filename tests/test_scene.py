@@ -279,6 +279,12 @@ def test_founders_of_another_dimension_are_refused():
         tf.Scene(tf.Mechanics(dim=2), founders=cells_in(3))
 
 
+@pytest.mark.parametrize("founders", [5, tf.Cells])
+def test_founders_that_are_no_cells_are_refused(founders):
+    with pytest.raises(tf.InputError, match=r"Scene\.founders = .*tf\.Cells\.single\(2\)"):
+        tf.Scene(tf.Growth(rate=1.0), founders=founders)
+
+
 def test_cells_of_another_dimension_are_refused():
     with pytest.raises(tf.InputError, match="2-D"):
         tf.Scene(tf.Mechanics(dim=2)).bind(cells=cells_in(3)).start()

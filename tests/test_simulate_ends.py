@@ -94,6 +94,7 @@ def test_an_end_in_the_past_is_refused():
         ({"until": 1.0, "on_failure": "ignore"}, "on_failure"),
         ({"until": 1.0, "record": 3}, "record = 3"),
         ({"until": 1.0, "observers": [print, 3]}, "observers"),
+        ({"until": 1.0, "observers": [tf.LivePlot]}, r"observers.*LivePlot\(\) with its brackets"),
     ],
 )
 def test_bad_options_are_refused_before_anything_runs(options, word):

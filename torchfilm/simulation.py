@@ -122,10 +122,13 @@ def _check_options(
     """Raise InputError for options that mean nothing."""
     if not (record is None or isinstance(record, (str, Path)) or hasattr(record, "attach")):
         raise checks.input_error("record", record, "the path of a new results file, or a Recorder")
+    rule = "a list of functions that are called with a state"
     if not all(callable(o) for o in observers):
-        raise checks.input_error(
-            "observers", observers, "a list of functions that are called with a state"
-        )
+        raise checks.input_error("observers", observers, rule)
+    for observer in observers:
+        if isinstance(observer, type):  # to call it with a state would make another, or fail
+            hint = f"Write {observer.__name__}() with its brackets."
+            raise checks.input_error("observers", observer, rule, hint)
     if until is None and cells is None:
         raise checks.InputError(
             "simulate needs an end: give until=… (hours) or cells=… (per colony)."

@@ -13,6 +13,11 @@ F64 = torch.float64
 POWERS = [1.0, 1.5, 2.0, 2.5, 4.0, 8.0]
 
 
+def test_plain_numbers_have_values():
+    assert float(activation(2.0, 1.0, 2)) == pytest.approx(0.8, rel=1e-15)
+    assert float(repression(-2, 1)) == 1.0 and float(michaelis_menten(3, 1.0)) == 0.75
+
+
 @pytest.mark.parametrize("power", POWERS)
 @pytest.mark.parametrize("tensor", [False, True], ids=["number", "tensor"])
 def test_values(device, dtype, power, tensor):

@@ -36,6 +36,9 @@ from torchfilm.tools.checks import InputError
 
 # Fields that a scene sets for its own cells, and that would overrule those of another scene.
 SET_BY_EFFECTS = ("growth_rate", "division_threshold", "birth_length")
+BY_NUMBER = {
+    "time": "Frames go by number: int(abs(results.times - t).argmin()) is the one nearest to t h."
+}
 # Groups whose datasets grow with the run, beside frames/step.
 GROWING = (
     "cells",
@@ -199,12 +202,14 @@ class Results(metaclass=checks.KnownKeywords):
             )
         return frame % len(self)
 
+    @partial(checks.known_keywords, instead=BY_NUMBER)
     def frame(self, frame: int = -1) -> dict[str, np.ndarray]:
         """Arrays of one frame by name: colony (place in the batch), uid, parent, position, axis,
         length, radius and the fields per cell."""
         rows = self._rows(self._index(frame))
         return {name: self._read(f"cells/{name}", rows) for name in self._names("cells")}
 
+    @partial(checks.known_keywords, instead=BY_NUMBER)
     def cells(self, frame: int = -1, *, fields: Sequence[str] | None = None) -> Cells:
         """The cells of one frame, to start another scene from; `state` goes on with the same one.
         Colonies are numbered by their places in the batch. fields: which recorded fields the cells
@@ -292,6 +297,7 @@ class Results(metaclass=checks.KnownKeywords):
         parameters, and functions with the same code."""
         check_same_scene(self.file.attrs, self.path, scene)
 
+    @partial(checks.known_keywords, instead=BY_NUMBER)
     def table(self, frame: int | None = None, *, internals: bool = False) -> dict[str, np.ndarray]:
         """One row per cell, one column per quantity: of one frame, or of all.
 
@@ -400,6 +406,7 @@ class Results(metaclass=checks.KnownKeywords):
         view = view_of(self, pixel_size, colony, frames, window, None, section=False)
         return write_fluorescence(view, path, channels, profile, camera, overwrite)
 
+    @partial(checks.known_keywords, instead=BY_NUMBER)
     def state(
         self,
         scene: Scene,

@@ -89,6 +89,10 @@ class PlotStyle:
                 self.section,
                 "omitted without a background: it sets where to cut the signal",
             )
+        if self.limits is not None and not isinstance(self.limits, Mapping):
+            name = next((n for n in (*self.quantities, self.background) if n and n != ANGLE), "yfp")
+            rule = f'ranges by name of a drawn quantity, such as {{"{name}": (0, 2)}}'
+            raise checks.input_error("limits", self.limits, rule)
         for name, pair in (self.limits or {}).items():
             low, high = checks.vector(f"limits[{name!r}]", pair, 2)
             if low >= high:

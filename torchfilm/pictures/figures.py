@@ -77,6 +77,9 @@ def show(
     picture. dpi: pixels per inch; a page is 7.2 inches wide.
     """
     figure_class()
+    if values is not None and not isinstance(values, Mapping):
+        rule = 'numbers of each cell by name, such as {"my level": level}'
+        raise checks.input_error("values", values, rule)
     if values and colour is None and channels is None:
         colour = next(iter(values))
     style = PlotStyle(colour, channels, background, limits, view, section, whole)
@@ -119,6 +122,8 @@ def _one_time(
 ) -> Figure:
     """Colonies at one time. heading: the words before the time, where there is no title."""
     places, more = choose_colonies(frame.counts > 0, frame.colony_id, colonies, most)
+    if title is not None and not isinstance(title, str):
+        raise checks.input_error("title", title, "text")
     if title is None:
         title = f"{heading}t = {frame.time:.5g} h{view_note(style)}"
     return sheet_figure(frame, places, style, title + more, dpi)
@@ -275,6 +280,8 @@ def choose_colonies(
 
     Raises InputError if no colony has cells, or a given id has none.
     """
+    checks.integer("most", most, least=1)
+    colonies = checked_ids(colonies)
     alive = [int(p) for p in np.flatnonzero(present)]
     if not alive:
         raise checks.InputError(
@@ -290,12 +297,23 @@ def choose_colonies(
         return alive[:most], f" ({', '.join(notes)})" if notes else ""
     places = {int(ids[p]): p for p in alive}
     wrong = [c for c in colonies if c not in places]
-    if wrong or not colonies:
+    if wrong:
         shown = ", ".join(map(str, list(places)[:12])) + (", …" if len(places) > 12 else "")
         raise checks.input_error(
-            "colonies", list(colonies), f"ids of colonies that have cells here: {shown}"
+            "colonies", colonies, f"ids of colonies that have cells here: {shown}"
         )
     return [places[c] for c in dict.fromkeys(colonies)], ""
+
+
+def checked_ids(colonies: object) -> list[int] | None:
+    """The ids of colonies to draw as a list; None for all. Raises InputError for anything else."""
+    if colonies is None:
+        return None
+    listed = colonies.tolist() if hasattr(colonies, "tolist") else colonies
+    if not isinstance(listed, (list, tuple, range)) or not listed:
+        hint = f"Write colonies=[{listed}]." if isinstance(listed, int) else ""
+        raise checks.input_error("colonies", colonies, "a list of at least one colony's id", hint)
+    return [checks.integer("colonies", each, least=0) for each in listed]
 
 
 def choose_frames(

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from torchfilm.io.new_file import written_whole
 from torchfilm.pictures.colours import CELLS, Limits, PlotStyle
-from torchfilm.pictures.figures import state_figure
-from torchfilm.pictures.page import check_picture_path, figure_class, save
+from torchfilm.pictures.figures import checked_ids, state_figure
+from torchfilm.pictures.page import check_picture_path, checked_dpi, figure_class, save
 from torchfilm.pictures.picture import png_of
 from torchfilm.scene import Scene
 from torchfilm.state import State
@@ -64,7 +64,8 @@ class LivePlot(metaclass=checks.KnownKeywords):
             hint = "A notebook needs none."
             raise checks.input_error("LivePlot.out", out, "the picture's path in a script", hint)
         self.out = None if out is None else check_picture_path(out)
-        self.scene, self.colonies, self.most, self.dpi = scene, colonies, most, dpi
+        self.scene, self.colonies = scene, checked_ids(colonies)
+        self.most, self.dpi = checks.integer("most", most, least=1), checked_dpi(dpi)
         self._begin()
 
     def _begin(self) -> None:

@@ -11,7 +11,7 @@ from torchfilm.initial_cells import Cells
 from torchfilm.micrographs.mask_files import read_image
 from torchfilm.micrographs.record import Micrograph
 from torchfilm.pictures.draw import scale_bar
-from torchfilm.pictures.page import figure_class, set_page_title
+from torchfilm.pictures.page import checked_dpi, figure_class, set_page_title
 from torchfilm.pictures.picture import Picture
 from torchfilm.pictures.shapes import outlines
 from torchfilm.tools import checks
@@ -60,6 +60,7 @@ def overlay(
     if depth is None:
         depth = SHALLOW * 2.0 * float(np.median(cells.radius)) if cells.count else 0.0
     checks.number("depth", depth, least=0.0, hint="µm.")
+    checked_dpi(dpi)
     image, source, _ = read_image(over, frame, "micrograph")
     seen = cells.micrograph
     _check_within(cells, seen, image, source)

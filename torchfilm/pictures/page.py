@@ -253,6 +253,7 @@ def make_page(
 
     The panels are empty but have their windows.
     """
+    checked_dpi(dpi)
     width, height = layout.size
     room = WIDTH - 2 * EDGE - (columns - 1) * GAP
     panel = min(room / columns, ((HEIGHT - 1.2) / rows - HEAD) * width / height)
@@ -290,6 +291,11 @@ def make_page(
         colour_bar(place(x, under + y, w, 0.08), scale)
     set_page_title(figure, title)
     return figure, axes
+
+
+def checked_dpi(dpi: float) -> float:
+    """The pixels per inch of a picture. Raises InputError for what is no number from 1 on."""
+    return checks.number("dpi", dpi, least=1.0, hint="Pixels per inch.")
 
 
 def set_page_title(figure: Figure, title: str) -> None:
@@ -358,9 +364,12 @@ def save(figure: Figure, path: str | Path) -> Path:
 
 
 def check_picture_path(path: object) -> Path:
-    """The path of a picture. Raises InputError for what is no path, or has no suffix."""
-    # matplotlib would add a suffix, and perhaps replace another file
-    if not isinstance(path, (str, Path)) or not Path(path).suffix:
+    """The path of a picture. Raises InputError for what is no path, or has no suffix of a picture:
+    matplotlib would add one, and perhaps replace another file."""
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    known = FigureCanvasBase.get_supported_filetypes()
+    if not isinstance(path, (str, Path)) or Path(path).suffix.lower()[1:] not in known:
         rule = "a path whose name ends in .png, .pdf or .svg"
         raise checks.input_error("picture", str(path), rule)
     return Path(path)

@@ -81,14 +81,14 @@ def unknown_keyword(
     )
 
 
-def known_keywords(function: F) -> F:
+def known_keywords(function: F, instead: Mapping[str, str] | None = None) -> F:
     """Let a function raise InputError, with the nearest name, for a keyword that it does not take,
-    and for an argument that is missing."""
+    and for an argument that is missing. instead: as in `unknown_keyword`."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)
     def checked(*args: Any, **given: Any) -> Any:
-        check_call(function.__name__, signature, args, given)
+        check_call(function.__name__, signature, args, given, instead)
         return function(*args, **given)
 
     return cast(F, checked)
@@ -117,10 +117,19 @@ def check_call(
     try:
         signature.bind(*args, **given)
     except TypeError as error:
-        hint = unnamed if str(error).startswith("too many positional") else ""
+        many = str(error).startswith("too many positional")
+        hint = (unnamed or _named_only(found, args[-1])) if many else ""
         raise InputError(
             f"{name}: {error}.{hint and ' ' + hint} Its parameters: {', '.join(allowed)}."
         ) from None
+
+
+def _named_only(found: Mapping[str, Any], last: object) -> str:
+    """What to write in place of a last argument that has no name but needs one."""
+    named = [n for n, kind in found.items() if kind is inspect.Parameter.KEYWORD_ONLY]
+    if "out" in named and isinstance(last, (str, os.PathLike)):
+        return f"Write out={os.fspath(last)!r}."
+    return f"Name them, such as {named[0]}=…." if named else ""
 
 
 def only_own_data(file: Any) -> None:
