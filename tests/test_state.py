@@ -70,6 +70,16 @@ def test_fields_are_attributes_and_unknown_names_are_reported():
     with pytest.raises(AttributeError, match=message):
         state.grwth_rate  # noqa: B018
     assert not hasattr(state, "displacement")
+    with pytest.raises(AttributeError, match=r"no 'y'\. It is position\[:, 1\]\."):
+        state.y  # noqa: B018
+
+
+def test_names_of_fields_are_completed():
+    """But not those that serve the numerics, nor signals, which are no attributes."""
+    hidden = tf.Field("hidden", "of the numerics", internal=True)
+    names = dir(batch().declare(hidden))
+    assert {"growth_rate", "position", "counts", "take"} <= set(names) and "hidden" not in names
+    assert all(name.isidentifier() for name in dir(tf.scenes.quorum_sensing().bind().start()))
 
 
 def test_an_unknown_signal_is_named_beside_those_there_are():

@@ -139,13 +139,12 @@ class State:
         fields = self.__dict__.get("fields", {})
         if name in fields:
             return fields[name]
-        declared = self.__dict__.get("declared", {})
-        shown = [n for n in fields if not (n in declared and declared[n].internal)]
-        near = checks.suggestion(name, [*PER_CELL, *PER_COLONY, "volume", "area", *fields])
-        raise AttributeError(
-            f"the state has no {name!r}. {near + ' ' if near else ''}Beside {', '.join(PER_CELL)}"
-            f" it has the fields {', '.join(shown) or 'none'}."
-        )
+        known = (*PER_CELL, *PER_COLONY, "volume", "area", *fields)
+        raise row_checks.no_such_part(name, PER_CELL, self._own_fields(), known)
+
+    def __dir__(self) -> list[str]:
+        """With the fields, so that names are completed."""
+        return [*super().__dir__(), *(n for n in self._own_fields() if n.isidentifier())]
 
     @property
     def cells(self) -> int:
@@ -402,7 +401,9 @@ class State:
 
     def _own_fields(self) -> list[str]:
         """The fields but those that serve the numerics."""
-        return [n for n in self.fields if not self.declared[n].internal]
+        # not as attributes: a state that is being copied has none yet
+        fields, declared = (self.__dict__.get(n, {}) for n in ("fields", "declared"))
+        return [n for n in fields if not (n in declared and declared[n].internal)]
 
     def __repr__(self) -> str:
         colonies = displays.counted(self.colonies, "colony", "colonies")

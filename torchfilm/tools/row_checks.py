@@ -27,6 +27,20 @@ def out_of_range(name: str, rows: Tensor, count: int) -> checks.InputError:
     return checks.input_error(name, rows.tolist(), _rule(count))
 
 
+def no_such_part(
+    name: str, per_cell: Collection[str], fields: Collection[str], known: Collection[str]
+) -> AttributeError:
+    """The error for a name that a state does not have; raise what this returns. fields: those to
+    list. known: what may have been meant."""
+    near = checks.suggestion(name, known)
+    if name in ("x", "y", "z"):
+        near = f"It is position[:, {'xyz'.index(name)}]."
+    return AttributeError(
+        f"the state has no {name!r}. {near + ' ' if near else ''}Beside {', '.join(per_cell)} it"
+        f" has the fields {', '.join(fields) or 'none'}."
+    )
+
+
 def check_mask(name: str, mask: Any, count: int) -> None:
     """Raises InputError for what is no tensor of `count` truth values."""
     if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.shape != (count,):
