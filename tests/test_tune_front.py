@@ -75,6 +75,23 @@ def test_the_picture_has_what_ran_the_front_and_both_settings(priced, tmp_path):
     assert {y for _, y in places["requested error"]} == {1.0}
 
 
+def test_labels_of_the_front_end_in_the_picture(priced):
+    figure = priced.plot().figure
+    figure.draw_without_rendering()
+    (ax,) = figure.axes
+    assert ax.texts and all(
+        text.get_window_extent().x1 < ax.get_window_extent().x1 for text in ax.texts
+    )
+
+
+def test_a_result_is_shown_as_its_tables(priced):
+    """Shortly where a prompt names it."""
+    assert repr(priced).startswith("Tuned(") and repr(priced).endswith(
+        ", 1 %: dt=0.02, penalty=0.03, tolerance=0.1)"
+    )
+    assert "What accuracy costs" in priced._repr_html_()
+
+
 def test_an_error_of_nothing_is_drawn_on_logarithmic_axes(priced):
     """Whole numbers of cells are often exact."""
     exact = dataclasses.replace(priced, tries=[priced.own, trial(9.0, 0.0, dt=0.005)])

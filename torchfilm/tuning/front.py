@@ -90,6 +90,7 @@ def draw_front(tuned: Tuned) -> Figure:
         ax.plot(time, error, mark, color=colour, ms=size, ls="", label=label)
     ax.axhline(100 * tuned.error, color="C3", lw=0.8, ls=":", label="requested error")
     ax.set(xscale="log", yscale="log")
+    ax.margins(x=0.1)  # room for the label of the last point
     for axis, name in (
         (ax.xaxis, "computing time, relative to the scene's own settings"),
         (ax.yaxis, "greatest error of an observable (95 % upper bound), %"),

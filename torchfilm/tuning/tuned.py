@@ -8,6 +8,7 @@ from pathlib import Path
 
 from torchfilm.pictures.picture import Picture
 from torchfilm.scene import Scene
+from torchfilm.tools import displays
 from torchfilm.tuning.front import cost_front, draw_front, front_rows
 from torchfilm.tuning.observables import Error, percent
 from torchfilm.tuning.settings import Settings, typed, typed_text
@@ -83,6 +84,14 @@ class Tuned:
         settings. A notebook displays the picture; with `out` it is saved there, in place of an
         older one. Needs matplotlib (the `app` extra)."""
         return Picture(draw_front(self), out)
+
+    def __repr__(self) -> str:
+        given = ", ".join(f"{name}={value:.3g}" for name, value in self.settings.given.items())
+        own = "the scene's own settings"
+        return f"Tuned({self.scene.name}, {percent(self.error)}: {given or own})"
+
+    def _repr_html_(self) -> str:
+        return displays.card(repr(self), displays.text(str(self)))
 
     def __str__(self) -> str:
         return "\n".join(describe(self))
