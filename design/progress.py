@@ -30,6 +30,14 @@ def open_bar(
     return bar
 
 
+def finish(bar: tqdm | None) -> None:
+    """Show a bar full whose work is done with fewer than its total, if there is one: designs take
+    several colonies each, and the rest may pay for none."""
+    if bar is not None:
+        bar.total = bar.n
+        bar.refresh()
+
+
 def advance(bar: tqdm | None, colonies: float) -> None:
     """Add to what a bar counts, if there is one."""
     if bar is not None:

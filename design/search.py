@@ -20,13 +20,13 @@ from design.growing import FinishedColonies
 from design.known import KnownDesigns, Start, known_designs
 from design.methods import METHODS, Chosen, Method, choose, designs_of, method_of
 from design.objective import Objective
-from design.progress import advance, open_bar
+from design.progress import advance, finish, open_bar
 from design.proposal import Proposal, repeat_study
 from design.saved_design import why_unsaved
 from design.study import Study
 from design.task import Task, TaskOptions
 from design.trivial import check_within_reach
-from torchfilm import checks
+from torchfilm import checks, displays
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -93,6 +93,14 @@ class Search(TaskOptions):
         started = SearchProgress(self._open_study(None, "auto"), task.tried.why_regrown)
         object.__setattr__(self, "_progress", started)
 
+    def __repr__(self) -> str:
+        study = self.study
+        names = ", ".join(study.names)
+        return f"Search({study.about['scene']}, of {names}: {study.colonies:.0f} colonies so far)"
+
+    def _repr_html_(self) -> str:
+        return displays.card(repr(self), displays.text(self.study.info))
+
     @property
     def study(self) -> Study:
         """The evaluations so far."""
@@ -155,6 +163,7 @@ class Search(TaskOptions):
                 if finals is not None and not holds:
                     self._with_all_left(finals, colonies).run()
                 _show(bar, self.study)
+                finish(bar)
         except KeyboardInterrupt:
             self._report_interrupt(colonies)
             raise
@@ -361,10 +370,11 @@ class Search(TaskOptions):
 
     def _report_interrupt(self, colonies: int) -> None:
         study = self.study
+        found = "front" if self.objective.task.goals else "best"
         kept = (
             f"{study.path} keeps them; run the search again to resume it"
             if study.path
-            else "best() returns the best of them"
+            else f"search.{found}() returns the best of them"
         )
         print(f"stopped at {study.colonies:.0f} of {colonies} colonies; {kept}.", file=sys.stderr)
 

@@ -171,6 +171,27 @@ def test_a_design_that_cannot_be_saved_is_said_before_the_search(capsys):
         assert ("but not saved: fixed = Cells(1 cell" in capsys.readouterr().err) == said
 
 
+@pytest.mark.parametrize(
+    ("goals", "name"), [({"target": Level()}, "best"), ({"targets": [Level(), Level()]}, "front")]
+)
+def test_a_stopped_search_says_how_to_get_what_it_found(capsys, monkeypatch, goals, name):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    made = Search(lit, LIT, **goals, cells=3, replicates=2)
+    monkeypatch.setattr(Search, "_search", stop)
+    with pytest.raises(KeyboardInterrupt):
+        made.run(12, progress=False)
+    assert f"; search.{name}() returns the best of them." in capsys.readouterr().err
+
+
+def test_the_bar_of_a_search_ends_full(monkeypatch):
+    """Two designs of four colonies each are all that ten can pay for."""
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    search(replicates=4).run(10, progress=True)
+    assert "| 8/8 colonies " in sys.stderr.getvalue().splitlines()[-1]
+
+
 def test_a_search_that_tried_one_design_says_so(capsys):
     made = search()
     made.run(3, progress=False)
