@@ -126,7 +126,7 @@ class Best:
 
     def table(self) -> str:
         """The parameters with their bounds and the first guess, the losses and the measures."""
-        return report.table(self._report())
+        return displays.Text(report.table(self._report()))
 
     def colonies(self) -> list[FinishedColonies]:
         """The replicates at their ends, grown again once: the same colonies as were scored."""

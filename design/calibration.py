@@ -50,7 +50,7 @@ class Calibration:
         lines += [f"  {n:<16} {100 * v:.1f} %" for n, v in self.coverage(level).items()]
         if self.failed:
             lines.append(f"{self.failed} truths failed and are left out")
-        return "\n".join(lines)
+        return tf.displays.Text("\n".join(lines))
 
     def __repr__(self) -> str:
         return f"Calibration({len(self.ranks)} truths of {', '.join(self.names)})"

@@ -97,7 +97,8 @@ class Front:
     def table(self) -> str:
         """The goals and the parameters of each design; which lie at a bound; what colonies without
         a pattern would have; and what the search took. It grows the designs at both ends again."""
-        return "\n".join([*right_aligned(self._rows()), self._where(), *self._remarks()])
+        lines = [*right_aligned(self._rows()), self._where(), *self._remarks()]
+        return displays.Text("\n".join(lines))
 
     def _remarks(self) -> list[str]:
         """What to know of the designs, and of the search."""

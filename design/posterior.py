@@ -159,7 +159,7 @@ class Posterior:
         if self.surprises:
             lines.append("The model does not reach the data within these bounds:")
             lines += [f"  {words}" for words in self.surprises]
-        return "\n".join(lines)
+        return tf.displays.Text("\n".join(lines))
 
     def __repr__(self) -> str:
         return f"Posterior(mean={self.mean}, {len(self.points)} samples)"

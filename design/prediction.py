@@ -70,7 +70,7 @@ class Prediction:
         lines.append(f"loss of a simulation, median: {np.median(self.losses):.3g}")
         if self.failed:
             lines.append(f"{self.failed} simulations failed and are left out")
-        return "\n".join(lines)
+        return tf.displays.Text("\n".join(lines))
 
     def __repr__(self) -> str:
         return f"Prediction({len(self.statistics)} simulations of {len(self.places)} statistics)"

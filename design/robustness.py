@@ -123,7 +123,7 @@ class Robustness:
                 f" samples, {self.indices.colonies} colonies",
                 *_aligned(self._index_rows(self.indices)),
             ]
-        return "\n".join(lines)
+        return tf.displays.Text("\n".join(lines))
 
     def _change_rows(self) -> list[tuple[str, ...]]:
         head = ("parameter", "value", "changed to", "requested", "loss change", "± error")

@@ -101,7 +101,7 @@ class Study:
         """The best designs that were grown to full size, the first of equal ones first: loss, its
         spread between replicates, cells, and the values of the parameters. most: rows."""
         text, more = self._rows(most)
-        return "\n".join(right_aligned(text) + ([more] if more else []))
+        return displays.Text("\n".join(right_aligned(text) + ([more] if more else [])))
 
     def history(self, path: str | Path | None = None) -> dict[str, list[Any]]:
         """Every design that was grown, in order, as columns by name, for pandas or a plot: a row
@@ -151,7 +151,7 @@ class Study:
     @property
     def info(self) -> str:
         """What was searched, how far it has come, and what it found: a line for each."""
-        return "\n".join(f"{name:<11} {words}" for name, words in self._facts())
+        return displays.Text("\n".join(f"{name:<11} {words}" for name, words in self._facts()))
 
     def _facts(self) -> list[tuple[str, str]]:
         about, found = self.about, self.best()

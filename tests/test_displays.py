@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 import pytest
 
 import torchfilm as tf
-from design import Burden, Parameter, Search, Sobol
+from design import Burden, Observed, Parameter, Search, Sobol
 
 VOID = ("br", "img", "hr")
 
@@ -120,6 +120,22 @@ def test_a_study_shows_its_best_designs(search):
         assert word in shown
     assert repr(search.study).startswith("Study(scene, ") and "best loss" in repr(search.study)
     assert search.study.info.splitlines()[0].startswith("scene       scene, to 4 cells")
+
+
+def test_a_search_shows_how_far_it_has_come(search):
+    assert repr(search) == "Search(scene, of make: 16 colonies so far)"
+    assert "best loss" in page(search) and "parameter" in page(search)
+
+
+def test_data_are_shown_as_a_table():
+    seen = Observed.from_table({"length_um": [2.0, 3.0, 2.5], "colony": [0, 0, 1]})
+    assert "length" in page(seen) and "±" in page(seen)
+
+
+def test_tables_keep_their_lines_where_a_cell_ends_with_them(search):
+    seen = Observed.from_table({"length_um": [2.0, 3.0, 2.5], "colony": [0, 0, 1]})
+    for text in (search.best().table(), search.study.table(), search.study.info, seen.table()):
+        assert repr(text) == str(text) and "\n" in repr(text) and "<pre" in text._repr_html_()
 
 
 def test_ipython_is_not_imported():

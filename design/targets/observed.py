@@ -312,6 +312,9 @@ class Observed(Target):
     def __str__(self) -> str:
         return self.table()
 
+    def _repr_html_(self) -> str:  # the repr names all numbers: studies tell targets apart by it
+        return tf.displays.card("Observed", tf.displays.text(self.table()))
+
     @property
     def mark(self) -> str:
         return "lines: rings" if self.plan.positions else ""
@@ -332,7 +335,7 @@ class Observed(Target):
             for name in names:
                 k = self.plan.names.index(name)
                 lines.append(f"  {name:<24} {self.values[k]:>10.4g} ± {self.spread[k]:.2g}")
-        return "\n".join(lines)
+        return tf.displays.Text("\n".join(lines))
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         """Draw the rings around the colony's centre."""
@@ -381,12 +384,9 @@ def _shared(known: ColonyStatistics, like: Observed) -> ColonyStatistics:
     for name, group in (("lengths", "length"), ("ages", "age"), ("positions", "extent"),
                         ("alignment", "alignment")):  # fmt: skip
         if getattr(plan, name) and not getattr(known, name):
-            raise checks.input_error(
-                "Observed(like)",
-                like.describe(),
-                f"of statistics that these data have: they have no {name}",
-                "" if name == "positions" else f"Give like=….without({group!r}).",
-            )
+            rule = f"of statistics that these data have: they have no {name}"
+            hint = "" if name == "positions" else f"Give like=….without({group!r})."
+            raise checks.input_error("Observed(like)", like.describe(), rule, hint)
     return plan
 
 
