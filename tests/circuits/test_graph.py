@@ -242,7 +242,8 @@ def test_latex_literally():
         "$$\\begin{aligned}\n"
         r"\frac{d\,\mathrm{x\_1}}{dt} &= \mathrm{ahl}_{\mathrm{out}} -"
         r" \mathrm{k\_1}\,\mathrm{x\_1} \\" + "\n"
-        r"\frac{d\,\mathrm{still}}{dt} &= 0" + "\n\\end{aligned}$$"
+        r"\frac{d\,\mathrm{still}}{dt} &= 0 \\" + "\n"
+        r"&\text{(before dilution by growth)}" + "\n\\end{aligned}$$"
     )
 
 
@@ -250,9 +251,13 @@ def test_a_circuit_printed():
     assert str(signalling().graph) == (
         "d ahl/dt   = k·luxi + D·(out.ahl − ahl)·cell.area/cell.volume\n"
         "to out.ahl = −D·(out.ahl − ahl)·cell.area\n"
-        "d luxi/dt  = 0"
+        "d luxi/dt  = 0\n"
+        "(before dilution by growth)"
     )
     assert repr(signalling().graph) == str(signalling().graph)
+    whole = tf.Circuit(lambda u, s, p, cell: {"a": -u.a}, species="a", dilution=False).graph
+    assert str(whole) == "d a/dt = −a" and "text" not in whole._repr_latex_()
+    assert "dilution" not in str(signalling().graph.diluted(("ahl",), 1.0))
 
 
 # --- what is conserved, and what is read ----------------------------------------------------------
@@ -324,7 +329,9 @@ def test_both_forms_of_a_circuit_have_the_same_rates():
         *parts.degradation("red", 1.0), *parts.degradation("green", 1.0),
     ]  # fmt: skip
     one, other = (tf.Circuit(x, species=("red", "green"), k=4.0).graph for x in (switch, listed))
-    assert str(one) == ("d red/dt   = k/(1 + green^2) − red\nd green/dt = k/(1 + red^2) − green")
+    assert one.equations == (
+        "d red/dt   = k/(1 + green^2) − red\nd green/dt = k/(1 + red^2) − green"
+    )
     values = {"red": [0.3, 2.0], "green": [1.0, 0.0], "k": 4.0}
     for name, rate in one.evaluate(values).items():
         assert array(other.evaluate(values)[name]) == pytest.approx(array(rate), rel=1e-14)
@@ -335,7 +342,7 @@ def test_graphs_by_cell_type():
         {0: lambda u, s, p, cell: {"a": p.k * u.a}, 1: lambda u, s, p, cell: {"b": -u.b}},
         species=("a", "b"), k=1.0,
     )  # fmt: skip
-    assert [str(g) for g in two.graphs.values()] == [
+    assert [g.equations for g in two.graphs.values()] == [
         "d a/dt = k·a\nd b/dt = 0", "d b/dt = −b\nd a/dt = 0"
     ]  # fmt: skip
     assert two.graphs[1].unused == ("k",)

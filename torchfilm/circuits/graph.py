@@ -103,8 +103,8 @@ class CircuitGraph:
     """The equations of a circuit in the cells of one type.
 
     rates: of each species, conc/h. releases: what a cell releases to each signal, conc·µm³/h.
-    parameters: the constants that the circuit was given. Printed, it shows its equations; a
-    notebook shows them typeset.
+    parameters: the constants that the circuit was given. note: what the equations leave out, in
+    words. Printed, it shows its equations; a notebook shows them typeset.
     """
 
     species: tuple[str, ...]
@@ -112,6 +112,7 @@ class CircuitGraph:
     rates: Mapping[str, Expression]
     releases: Mapping[str, Expression]
     builder: Builder
+    note: str = ""
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -125,6 +126,11 @@ class CircuitGraph:
     # --- to look at ----------------------------------------------------------------------------
 
     def __str__(self) -> str:
+        return self.equations + (f"\n({self.note})" if self.note else "")
+
+    @property
+    def equations(self) -> str:
+        """A line for each equation, without the note."""
         left = {n: f"d {n}/dt" for n in self.rates} | {
             f"out.{n}": f"to out.{n}" for n in self.releases
         }
@@ -144,6 +150,7 @@ class CircuitGraph:
         still = [n for n in self.species if n not in self.rates]
         lines += [rf"\frac{{d\,{tex(n)}}}{{dt}} &= 0" for n in still]
         lines += [rf"{tex(n)} \to \mathrm{{out}} &= {latex(e)}" for n, e in self.releases.items()]
+        lines += [rf"&\text{{({self.note})}}"] if self.note else []
         return "$$\\begin{aligned}\n" + " \\\\\n".join(lines) + "\n\\end{aligned}$$"
 
     # --- to work with --------------------------------------------------------------------------
@@ -185,7 +192,7 @@ class CircuitGraph:
         for name in species:
             lost = make("mul", rate, self.builder.name(f"u.{name}"))
             rates[name] = make("sub", rates.get(name, 0.0), lost)
-        return replace(self, rates={n: rates[n] for n in self.species if n in rates})
+        return replace(self, rates={n: rates[n] for n in self.species if n in rates}, note="")
 
     def evaluate(self, values: Mapping[str, Any]) -> dict[str, Tensor]:
         """The rates, and as "out.name" what is released, at values by name: of species and
@@ -374,7 +381,7 @@ def _null_space(rates: np.ndarray) -> list[list[int]]:
 
 
 def graph_of(
-    part: Any, species: Sequence[str], parameters: Sequence[str], label: str
+    part: Any, species: Sequence[str], parameters: Sequence[str], label: str, note: str = ""
 ) -> CircuitGraph:
     """The graph of a rate function, or of a list of reactions, that nobody has bound: any signal
     and any property of a cell may be read. Raises Untraceable."""
@@ -412,7 +419,8 @@ def graph_of(
             raise checks.InputError(unknown(what, name, list(species)))
     made = of_names(inside)
     ordered = {n: made[n] for n in species if n in made}
-    return CircuitGraph(tuple(species), tuple(parameters), ordered, of_names(outside), builder)
+    names = tuple(species), tuple(parameters)
+    return CircuitGraph(*names, ordered, of_names(outside), builder, note)
 
 
 def _signals_in(reactions: Any) -> tuple[str, ...]:

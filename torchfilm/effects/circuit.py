@@ -35,6 +35,7 @@ from torchfilm.effects.circuit_checks import (
     check_species,
     diluted_names,
     equations_of,
+    left_out,
     mass_action_constants,
     names_of,
     no_cells_of,
@@ -297,7 +298,8 @@ class Circuit(Effect):
         for kind, part in self.rates.items():
             label = label_of(part)
             try:
-                found[kind] = graph_of(part, tuple(self.variables), tuple(self.parameters), label)
+                names = tuple(self.variables), tuple(self.parameters)
+                found[kind] = graph_of(part, *names, label, left_out(self))
             except Untraceable as why:
                 raise checks.InputError(
                     f"{self.value_owner()}: {label} cannot be written as equations: {why}. It still"

@@ -27,14 +27,19 @@ READ_BY_OTHERS = {"drag": "mechanics takes 'drag' as how much a cell resists mot
 
 def equations_of(circuit: Any) -> dict[str, str]:
     """The equations of a circuit as text, by title, or why they cannot be written."""
-    diluted = circuit.dilution is True or bool(circuit.dilution)
-    where = f"{circuit.value_owner()}{', before dilution by growth' if diluted else ''}"
+    note = left_out(circuit)
+    where = f"{circuit.value_owner()}{note and ', ' + note}"
     try:
         graphs = circuit.graphs
     except checks.InputError as why:
         return {where: str(why)}
     of_type = lambda kind: f", in cells of type {kind}" if isinstance(kind, int) else ""
-    return {where + of_type(kind): str(graph) for kind, graph in graphs.items()}
+    return {where + of_type(kind): graph.equations for kind, graph in graphs.items()}
+
+
+def left_out(circuit: Any) -> str:
+    """What the equations of a circuit do not show, in words; "" where they show all."""
+    return "before dilution by growth" if circuit.dilution else ""
 
 
 def names_of(species: Sequence[str], what: str = "species") -> tuple[str, ...]:
