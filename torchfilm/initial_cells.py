@@ -56,21 +56,18 @@ class Cells(metaclass=checks.KnownKeywords):
             )
         count = position.shape[0]
         axis = _array("axis", self.axis, np.float64)
-        if axis.ndim == 1 and axis.shape[0] == position.shape[1]:
+        # of two cells in the plane, two numbers may be angles, unless they are a unit vector
+        clear = count == 1 or axis.shape != (count,) or abs((axis**2).sum() - 1.0) < 1e-3
+        if axis.shape == position.shape[1:] and clear:
             axis = np.broadcast_to(axis, position.shape)
         if axis.shape != position.shape:
-            raise checks.input_error(
-                "Cells.axis",
-                f"an array of shape {axis.shape}",
-                f"of shape {position.shape}, like position",
-            )
+            given = f"an array of shape {axis.shape}"
+            rule = f"of shape {position.shape}, like position"
+            raise checks.input_error("Cells.axis", given, rule, self.instead["angle"])
         size = np.sqrt((axis**2).sum(1))
         if (size == 0).any():
-            raise checks.input_error(
-                f"Cells.axis[{int(np.argmin(size))}]",
-                axis[int(np.argmin(size))].tolist(),
-                "a direction that is not zero",
-            )
+            at, rule = int(np.argmin(size)), "a direction that is not zero"
+            raise checks.input_error(f"Cells.axis[{at}]", axis[at].tolist(), rule)
         parts: dict[str, Any] = {"position": position, "axis": axis / size[:, None]}
         for name, above in (("length", False), ("radius", True)):
             values: np.ndarray = (
