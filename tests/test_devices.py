@@ -55,6 +55,15 @@ def test_a_scene_runs_where_it_was_asked_to(pretended_cuda, name):  # noqa: F811
         assert torch.allclose(found.cpu().double(), right.double(), rtol=1e-6, atol=1e-9), n
 
 
+def test_values_for_a_device_may_meet_numbers(pretended_cuda):  # noqa: F811
+    column = torch.tensor([1.0, 2.0]).to("cuda")
+    drawn = tf.LogNormal(column, 0.2)
+    assert 0 < drawn.least() < 1 and drawn.greatest() > 2
+    assert tf.Uniform(0.5, column).greatest() == 2 and tf.Normal(column, 0.1).greatest() == 2.4
+    assert "rate" in repr(tf.Growth(rate={0: column, 1: 0.5}))
+    tf.Growth(rate={0: drawn, 1: 0.5})
+
+
 def test_pretended_tensors_refuse_others(pretended_cuda):  # noqa: F811
     one = torch.zeros(3, device="cuda")
     assert (

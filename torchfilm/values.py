@@ -162,14 +162,14 @@ def _checked_in_schedule(rule: Rule, name: str, given: Any) -> Any:
 
 
 def numbers(value: Any) -> Tensor:
-    """All numbers of a checked value that is not drawn, as a float64 tensor: to find its smallest
-    and largest."""
+    """All numbers of a checked value that is not drawn, float64 on the CPU: to find its smallest
+    and largest, for checks."""
     if isinstance(value, ByType):
         return torch.cat([numbers(v).reshape(-1) for v in value.values.values()])
     if isinstance(value, Distribution):
         return torch.tensor([value.least(), value.greatest()], dtype=torch.float64)
     inner = value.values if isinstance(value, PerColony) else value
-    return torch.as_tensor(inner, dtype=torch.float64).detach().reshape(-1)
+    return torch.as_tensor(inner, dtype=torch.float64, device="cpu").detach().reshape(-1)
 
 
 def smallest(value: Any) -> float:
