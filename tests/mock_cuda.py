@@ -33,6 +33,8 @@ MAY_MEET = {
 }
 # What must see the very tensors that it is given, and not others that share their numbers.
 OF_LEAVES = {"grad", "requires_grad_", "backward"}
+# Sums whose order, and so whose bits, are not fixed on CUDA.
+UNORDERED = {"cumsum", "index_add", "index_add_"}
 AS_TENSOR = torch.as_tensor
 
 
@@ -104,6 +106,8 @@ def _work(func: Any, args: tuple, kwargs: dict) -> Any:
             f"{name}: tensors on cuda {[tuple(x.shape) for x in there]} and on cpu"
             f" {[tuple(x.shape) for x in here]}"
         )
+    if there and name in UNORDERED and _sums_in_any_order(name, args):
+        raise RuntimeError(f"{name}: sums numbers on CUDA in no fixed order")
     bare = (lambda x: x) if name in OF_LEAVES else _plain
     with torch._C.DisableTorchFunctionSubclass():
         out = func(*tree_map(bare, args), **tree_map(bare, kwargs))
@@ -115,6 +119,14 @@ def _work(func: Any, args: tuple, kwargs: dict) -> Any:
     return tree_map(
         lambda x: x.as_subclass(Pretended) if stays and isinstance(x, torch.Tensor) else x, out
     )
+
+
+def _sums_in_any_order(name: str, args: tuple) -> bool:
+    """Whether it is a sum of floats several of which go to one place."""
+    with torch._C.DisableTorchFunctionSubclass():
+        if not args[0].is_floating_point():
+            return False
+        return name == "cumsum" or args[2].unique().numel() < args[2].numel()
 
 
 def _result_is_there(name: str, args: tuple, kwargs: dict, there: bool) -> bool:

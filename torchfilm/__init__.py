@@ -38,6 +38,7 @@ from torchfilm.tools import checks, displays, progress, tables, tangents
 from torchfilm.tools.checks import InputError, SimulationError
 from torchfilm.tools.hashing import digest
 from torchfilm.tools.memory import keep_memory
+from torchfilm.tools.ragged import Groups
 from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.timing import Timings
 from torchfilm.values import PerColony, physical
@@ -79,6 +80,7 @@ __all__ = [
     "Division",
     "Effect",
     "Field",
+    "Groups",
     "Growth",
     "GrowthRecording",
     "InputError",

@@ -85,14 +85,17 @@ class DomainSize(Target):
         z = ratio(a - b, a + b, 0.0)
         i, j, apart = tf.measure.neighbours(state, GAP)
         colony = state.colony.index_select(0, i)
-        add = lambda v: torch.zeros(state.colonies, dtype=torch.float64, device=v.device).index_add(
-            0, colony, v
-        )
-        count = add(torch.ones_like(apart))
         one, other = z.index_select(0, i), z.index_select(0, j)
-        unlike, decided = add(0.25 * (one - other) ** 2), add(0.5 * (one**2 + other**2))
+        parts = (
+            0.25 * (one - other) ** 2,
+            0.5 * (one**2 + other**2),
+            apart,
+            torch.ones_like(apart),
+        )
+        sums = tf.Groups(colony, state.colonies).sum(torch.stack(parts, 1))
+        unlike, decided, distance, count = sums.unbind(1)
         share = ratio(unlike, decided, 0.0)
-        return share, ratio(decided, count, 0.0), ratio(add(apart), count, 0.0), count
+        return share, ratio(decided, count, 0.0), ratio(distance, count, 0.0), count
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:

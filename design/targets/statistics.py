@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -37,6 +38,11 @@ class SeenCells:
     length: Tensor | None = None
     age: Tensor | None = None
     levels: Tensor | None = None
+
+    @cached_property
+    def groups(self) -> tf.Groups:
+        """The cells of each colony, for sums."""
+        return tf.Groups(self.colony, len(self.counts), ordered=True)
 
 
 @dataclass(frozen=True)
@@ -216,8 +222,7 @@ def _known(value: Tensor | None) -> Tensor:
 
 def _sums(value: Tensor, cells: SeenCells) -> Tensor:
     """The sums over colonies of (N, k): (B, k); cell by cell, whatever else is in the batch."""
-    out = value.new_zeros(len(cells.counts), value.shape[1], dtype=torch.float64)
-    return out.index_add(0, cells.colony, value.double())
+    return cells.groups.sum(value.double())
 
 
 def _means(value: Tensor, cells: SeenCells) -> Tensor:
@@ -294,7 +299,7 @@ def _over_pairs(value: Tensor, cells: SeenCells, pairs: Tensor) -> Tensor:
     """The mean over the pairs of each colony, (B, 1); 0 without pairs."""
     colony = cells.colony.index_select(0, pairs[0])
     both = torch.stack([value, torch.ones_like(value)], 1)
-    out = value.new_zeros(len(cells.counts), 2).index_add(0, colony, both)
+    out = tf.Groups(colony, len(cells.counts), ordered=True).sum(both)
     return ratio(out[:, :1], out[:, 1:], 0.0)
 
 
