@@ -11,11 +11,12 @@ from collections import namedtuple
 from pathlib import Path
 
 import pytest
+import torch
 from commands import shell
 
 import design
 import torchfilm as tf
-from torchfilm.io import room
+from torchfilm.io import layout, room
 
 Usage = namedtuple("Usage", "total used free")
 
@@ -43,6 +44,17 @@ def test_resume_needs_room_for_a_copy(results, monkeypatch):
         for _ in tf.simulate(scene, state=state, until=0.2, record=recorder):
             pass
     assert [*results.parent.iterdir()] == [results] and results.read_bytes() == before
+
+
+def test_the_room_for_a_frame_is_told_without_a_copy(results, monkeypatch):
+    """Of what lies on a GPU, which a copy of all columns would wait for."""
+    scene = tf.scenes.quorum_sensing()
+    with tf.Results(results) as kept:
+        state = kept.state(scene)
+    columns = (layout.cell_columns, layout.voxel_columns, layout.colony_columns)
+    written = sum(v.nbytes for of in (*columns, layout.found_columns) for v in of(state).values())
+    monkeypatch.setattr(torch.Tensor, "cpu", None)
+    assert 0 <= layout.frame_bytes(state) - written < 1000  # counts and grids
 
 
 def test_an_export_stops_while_its_file_can_be_closed(results, monkeypatch):

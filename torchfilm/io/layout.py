@@ -103,6 +103,17 @@ def grid_columns(state: State, first_voxel: int = 0) -> dict[str, np.ndarray]:
     }
 
 
+def frame_bytes(state: State) -> int:
+    """The size of the arrays of a frame, told by their shapes: nothing is copied from a GPU."""
+    of_colonies = [v for n, v in state.fields.items() if state.declared[n].scope == COLONY]
+    grid = [] if state.layout is None else [state.layout.grid.origin, state.layout.grid.shape]
+    columns = [*state.cell_columns().values(), *state.signals.values(), *of_colonies, *grid]
+    at_cells = state.cells * len(state.signals) * state.length.element_size()
+    return at_cells + sum(
+        v.numel() * v.element_size() for v in (*columns, state.counts, state.next_uid)
+    )
+
+
 def create_framed(file: h5py.File, name: str, dtype: Any, shape: Sequence[int], chunk: int) -> None:
     """Create an empty dataset of rows of this shape, compressed, to which whole frames are
     added."""

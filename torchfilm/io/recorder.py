@@ -26,6 +26,7 @@ from torchfilm.io.layout import (
     create_framed,
     create_tables,
     found_columns,
+    frame_bytes,
     grid_columns,
     next_chunk,
     numpy_of,
@@ -333,15 +334,8 @@ class Recorder(metaclass=checks.KnownKeywords):
 
     def _check_free_bytes(self, state: State) -> None:
         """Stop while the file is still whole: a full disk damages an HDF5 file."""
-        columns = (cell_columns, voxel_columns, colony_columns, grid_columns)
-        needed = (
-            sum(v.nbytes for of in columns for v in of(state).values())
-            + numpy_of(state.counts).nbytes
-            + numpy_of(state.next_uid).nbytes
-            + state.cells * len(state.signals) * state.length.element_size()
-            + sum(c.nbytes for e in (*self.births, *self.ends) for c in e)
-            + SPARE_BYTES
-        )
+        of_ends = sum(c.nbytes for e in (*self.births, *self.ends) for c in e)
+        needed = frame_bytes(state) + of_ends + SPARE_BYTES
         path = self.target if self.written >= 0 else self.source
         free = free_bytes(self.target.parent, path.stat().st_size)
         if free < needed:
