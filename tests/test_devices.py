@@ -55,6 +55,13 @@ def test_a_scene_runs_where_it_was_asked_to(pretended_cuda, name):  # noqa: F811
         assert torch.allclose(found.cpu().double(), right.double(), rtol=1e-6, atol=1e-9), n
 
 
+def test_a_model_of_another_gpu_refuses_a_state(pretended_cuda):  # noqa: F811
+    """All that is pretended to be on some GPU is on the first."""
+    with pytest.raises(tf.InputError, match=r"on cuda:0' .*on cuda:1, as the model is"):
+        tf.scenes.build("microcolony").bind(1, device="cuda:1")
+    tf.scenes.build("microcolony").bind(1, device="cuda")
+
+
 def test_values_for_a_device_may_meet_numbers(pretended_cuda):  # noqa: F811
     column = torch.tensor([1.0, 2.0]).to("cuda")
     drawn = tf.LogNormal(column, 0.2)

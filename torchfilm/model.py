@@ -167,7 +167,8 @@ class Model:
         """Raise InputError if this is not a state of this model."""
         if state.dim != self.dim:
             raise checks.input_error("state", f"{state.dim}-D", f"{self.dim}-D, as the scene is")
-        if state.dtype != self.batch.dtype or state.device.type != self.batch.device.type:
+        there = checks.same_device(state.device, self.batch.device)
+        if state.dtype != self.batch.dtype or not there:
             raise checks.input_error(
                 "state",
                 f"{state.dtype} on {state.device}",

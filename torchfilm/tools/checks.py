@@ -395,3 +395,9 @@ def device(given: str | torch.device) -> torch.device:
             'torch sees no CUDA GPU; use device="cpu".',
         )
     return wanted
+
+
+def same_device(one: torch.device, other: torch.device) -> bool:
+    """Whether these are one device; "cuda" without a number may be any GPU."""
+    same_number = None in (one.index, other.index) or one.index == other.index
+    return one.type == other.type and same_number
