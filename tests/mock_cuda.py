@@ -33,6 +33,7 @@ MAY_MEET = {
 }
 # What must see the very tensors that it is given, and not others that share their numbers.
 OF_LEAVES = {"grad", "requires_grad_", "backward"}
+LISTS = ("stack", "cat")
 # Sums whose order, and so whose bits, are not fixed on CUDA.
 UNORDERED = {"cumsum", "index_add", "index_add_"}
 AS_TENSOR = torch.as_tensor
@@ -100,7 +101,8 @@ def _work(func: Any, args: tuple, kwargs: dict) -> Any:
         return True
     tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, torch.Tensor)]
     there = [x for x in tensors if type(x) is Pretended]
-    here = [x for x in tensors if type(x) is not Pretended and x.dim() > 0]
+    # single numbers of the CPU may meet any, but in a list
+    here = [x for x in tensors if type(x) is not Pretended and (x.dim() or name in LISTS)]
     if there and (name == "numpy" or (here and name not in MAY_MEET)):
         raise RuntimeError(
             f"{name}: tensors on cuda {[tuple(x.shape) for x in there]} and on cpu"

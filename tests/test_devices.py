@@ -62,6 +62,19 @@ def test_a_model_of_another_gpu_refuses_a_state(pretended_cuda):  # noqa: F811
     tf.scenes.build("microcolony").bind(1, device="cuda")
 
 
+def test_a_field_on_another_device_is_refused_at_once(pretended_cuda):  # noqa: F811
+    state = tf.scenes.build("microcolony").bind(1, device="cuda").start()
+    with pytest.raises(tf.InputError, match=r"'growth_rate' = 'cpu'.* cuda:0, as the state is"):
+        state.with_fields(growth_rate=torch.ones(1))
+    state.with_fields(growth_rate=torch.ones(1, device="cuda"))
+
+
+def test_a_list_may_mix_tensors_there_and_numbers(pretended_cuda):  # noqa: F811
+    one = torch.tensor(2.0).to("cuda")
+    found = tf.checks.value("rate", [1.0, one, torch.tensor(3.0)])
+    assert found.device.type == "cuda" and found.tolist() == [1.0, 2.0, 3.0]
+
+
 def test_values_for_a_device_may_meet_numbers(pretended_cuda):  # noqa: F811
     column = torch.tensor([1.0, 2.0]).to("cuda")
     drawn = tf.LogNormal(column, 0.2)

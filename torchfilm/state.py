@@ -260,7 +260,7 @@ class State:
                 sorted(values.keys() - self.declared.keys()),
                 f"declared; known are {', '.join(self.declared) or 'none'}",
             )
-        row_checks.check_tensors(values, self.fields, self._shape_of)
+        row_checks.check_tensors(values, self.fields, self.device, self._shape_of)
         return self.replace(fields={**self.fields, **values})
 
     @property

@@ -245,10 +245,12 @@ def value(
     keeps its gradient.
     """
     if isinstance(given, (list, tuple)):
+        devices = [x.device for x in given if isinstance(x, Tensor)]
         try:
             given = (
-                torch.stack([torch.as_tensor(x).to(torch.float64) for x in given])
-                if any(isinstance(x, Tensor) for x in given)
+                # on a GPU where one of them is
+                _stacked(given, next((d for d in devices if d.type != "cpu"), devices[0]))
+                if devices
                 else torch.tensor(given, dtype=torch.float64)
             )
         except (TypeError, ValueError, RuntimeError) as error:
@@ -275,6 +277,10 @@ def value(
             f" {detached.numel()} values): each must be {_rule(above, least, most)}."
         )
     return given
+
+
+def _stacked(given: Sequence[Any], device: torch.device) -> Tensor:
+    return torch.stack([torch.as_tensor(x).to(device, torch.float64) for x in given])
 
 
 def below(low: float | Tensor, high: float | Tensor) -> bool:

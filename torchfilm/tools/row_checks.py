@@ -118,14 +118,21 @@ def check_geometry(columns: Mapping[str, Tensor], colonies: int, dim: int, dtype
 
 
 def check_tensors(
-    values: Mapping[str, Any], present: Mapping[str, Tensor], shape: Callable[[str], Sequence[int]]
+    values: Mapping[str, Any],
+    present: Mapping[str, Tensor],
+    device: torch.device,
+    shape: Callable[[str], Sequence[int]],
 ) -> None:
-    """Raises InputError for a field's new values that are no tensor, or not of the shape and kind
-    of those that are present. shape: that a field should have; it is asked where it has changed."""
+    """Raises InputError for a field's new values that are no tensor, not on the state's device, or
+    not of the shape and kind of those that are present. shape: that a field should have; it is
+    asked where it has changed."""
     for name, value in values.items():
         if not isinstance(value, Tensor):
             rule = "a tensor with a row for each cell, colony or voxel"
             raise checks.input_error(f"the field {name!r}", value, rule)
+        if value.device != device:
+            what, hint = f"device of the field {name!r}", "Make it with device=state.device."
+            raise checks.input_error(what, str(value.device), f"{device}, as the state is", hint)
         now = present.get(name)
         if now is None or (value.shape == now.shape and value.dtype == now.dtype):
             continue
