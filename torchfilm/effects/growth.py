@@ -248,6 +248,7 @@ class _BoundGrowth(BoundEffect):
 
     effect: Growth
     setters: tuple[str, ...] = ()  # effects that set growth_rate, whatever it was
+    changers: tuple[str, ...] = ()  # rules that change it by what it was
 
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         """Raise InputError where a rate by cell type would undo what another effect sets."""
@@ -255,6 +256,13 @@ class _BoundGrowth(BoundEffect):
             e.title
             for e in effects
             if e is not self and "growth_rate" in e.writes() and "growth_rate" not in e.reads()
+        )
+        self.changers = tuple(
+            e.title
+            for e in effects
+            if e.effect.writes_anything
+            and {"growth_rate"} <= {*e.writes()} & {*e.reads()}
+            and e.stage < GROWTH
         )
         for other in effects if self.effect.by_type else ():
             if other is not self and "growth_rate" in other.writes():
@@ -281,6 +289,12 @@ class _BoundGrowth(BoundEffect):
         """Warn where a growth rate has no effect since an effect sets another one."""
         rate = self.effect.rate
         given = [] if rate is None or not bool(numbers(rate).any()) else ["Growth.rate"]
+        if given and self.changers:
+            warn(
+                f"{' and '.join(self.changers)} read growth_rate and set it: what multiplies it"
+                " does so again in each step. What slows cells down is a factor of its own:"
+                " tf.Growth(rate=…, factor='vigour') and tf.Rules(…, variables={'vigour': 1.0})."
+            )
         sources = [*given, *self.setters]
         if len(sources) > 1:
             first = "Growth.rate is that of first cells only, and " if given else ""
