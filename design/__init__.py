@@ -38,6 +38,7 @@ from design.study import Study
 from design.targets import (
     Bands,
     Burden,
+    Composition,
     Constrained,
     DomainSize,
     Duration,
@@ -68,6 +69,7 @@ __all__ = [
     "Burden",
     "Calibration",
     "Choice",
+    "Composition",
     "Constrained",
     "DomainSize",
     "Duration",

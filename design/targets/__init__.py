@@ -1,6 +1,7 @@
 """Targets: patterns of a colony. The loss of each is 0 where the colony has the pattern."""
 
 from design.targets.base import Target
+from design.targets.composition import Composition
 from design.targets.goals import Burden, Constrained, Duration, Goals, Spread, Weighted
 from design.targets.image import Image
 from design.targets.lasting import Lasting
@@ -14,6 +15,7 @@ from design.targets.stripe import Stripe
 __all__ = [
     "Bands",
     "Burden",
+    "Composition",
     "Constrained",
     "DomainSize",
     "Duration",
