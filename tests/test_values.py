@@ -51,6 +51,16 @@ def test_a_growth_rate_for_each_type_follows_the_type():
     assert ratio.tolist() == pytest.approx([math.exp(0.5 * 0.5 + 1.5 * 0.5)] * 2, rel=1e-12)
 
 
+def test_a_tuple_that_reads_like_a_range_is_warned_of():
+    words = (
+        r"Division\.length = \(3\.5, 4\.5\) is one value .*two colonies.*tf\.Uniform\(3\.5, 4\.5\)"
+    )
+    with pytest.warns(UserWarning, match=words):
+        tf.Division(length=(3.5, 4.5))
+    for given in ([3.5, 4.5], (4.5, 3.5), (3.5, 4.0, 4.5)):  # as an error would tell
+        tf.Division(length=given)
+
+
 def test_one_value_per_colony_as_list_array_or_tensor_is_one():
     given = [0.5, 1.0, 1.5]
     states = [

@@ -19,7 +19,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from numbers import Integral
+from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
@@ -27,6 +27,7 @@ from torch import Tensor
 
 from torchfilm.signals.schedule import Schedule, checked_values
 from torchfilm.tools import checks
+from torchfilm.tools.warn_once import warn
 
 if TYPE_CHECKING:
     from torchfilm.resolver import Values
@@ -151,6 +152,8 @@ def checked(name: str, given: object, rule: Rule, forms: str = FORMS) -> Any:
             raise checks.input_error(name, given, "a list or 1-D tensor with one number per colony")
         return PerColony(inner)
     hint = forms if rule.scope == CELL else checks.ONE_OR_EACH
+    if rule.scope == CELL:
+        _warn_of_range(name, given)
     return checks.value(name, given, hint=hint, **bounds)
 
 
@@ -159,6 +162,17 @@ def _checked_in_schedule(rule: Rule, name: str, given: Any) -> Any:
     if is_drawn(value):
         raise checks.input_error(name, given, "a number, one per colony, or one per cell type")
     return value
+
+
+def _warn_of_range(name: str, given: Any) -> None:
+    """Warn of values of two colonies that read like a range: a tuple, in order."""
+    two = isinstance(given, tuple) and len(given) == 2 and all(isinstance(x, Real) for x in given)
+    if two and given[0] < given[1]:
+        low, high = (f"{x:g}" for x in given)
+        warn(
+            f"{name} = ({low}, {high}) is one value for each of two colonies. If it is a range from"
+            f" which each cell draws, write tf.Uniform({low}, {high}); else [{low}, {high}]."
+        )
 
 
 def numbers(value: Any) -> Tensor:
