@@ -133,7 +133,8 @@ def fresh_words(task: Task, fresh: FreshLosses) -> str:
 
 def show_loss(loss: float) -> str:
     """Four decimals, but of what is as large as the loss of a failed colony."""
-    return f"{loss:.4f}" if abs(loss) < LARGE else f"{loss:.4g}"
+    # without the sign of what rounds to 0
+    return f"{round(loss, 4) + 0.0:.4f}" if abs(loss) < LARGE else f"{loss:.4g}"
 
 
 def _seeds(task: Task, fresh: FreshLosses) -> str:

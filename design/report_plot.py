@@ -131,7 +131,7 @@ def _draw_row(
     """Draw colonies of one design, coloured by the species of the target. Returns the scales of the
     colours; none without species or colonies."""
     names = list(limits)
-    colour = names[0] if len(names) == 1 else None
+    colour = names[0] if len(names) == 1 else None if names else target.strains
     channels = {n: _colour(n, k) for k, n in enumerate(names)} if len(names) > 1 else None
     scales: list[Any] = []
     for ax, (done, k), cells in zip(axes, grown, frames, strict=False):

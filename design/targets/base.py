@@ -116,6 +116,12 @@ class Target(metaclass=checks.KnownKeywords):
         return {}
 
     @property
+    def strains(self) -> str | None:
+        """The field by which the target tells strains apart, where it does: pictures show it where
+        the target reads no species."""
+        return None
+
+    @property
     def bounds(self) -> dict[str, str]:
         """The constraints on measures, such as "≥ 10", where the target has some."""
         return {}

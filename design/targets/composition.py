@@ -53,6 +53,10 @@ class Composition(Target):
             rule = "the name of a field of whole numbers"
             raise checks.input_error("Composition.field", self.field, rule)
 
+    @property
+    def strains(self) -> str:
+        return self.field
+
     def check(self, state: tf.State) -> None:
         tf.measure.strains(state, self.field)  # raises where there is no such field
 

@@ -131,6 +131,10 @@ class Lasting(Target):
         return self.target.anywhere
 
     @property
+    def strains(self) -> str | None:
+        return self.target.strains
+
+    @property
     def lit_from(self) -> dict[str, float]:
         return self.target.lit_from
 

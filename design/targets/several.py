@@ -94,6 +94,10 @@ class Several(Target):
         return "; ".join(dict.fromkeys(part.mark for part in self.parts if part.mark))
 
     @property
+    def strains(self) -> str | None:
+        return next((part.strains for part in self.parts if part.strains), None)
+
+    @property
     def lit_from(self) -> dict[str, float]:
         found: dict[str, float] = {}
         for name, level in (pair for part in self.parts for pair in part.lit_from.items()):

@@ -82,6 +82,7 @@ def test_it_may_last_and_be_weighed():
     target = Weighted([(lasting, 1.0)])
     search = Search(strains, [Parameter("rate", 0.9, 1.1)], target, until=1.0, replicates=2)
     assert search.run(colonies=8, progress=False).loss < 0.05
+    assert target.strains == "cell_type"  # by which pictures colour the cells
 
 
 @pytest.mark.parametrize(
