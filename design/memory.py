@@ -102,7 +102,7 @@ def _left_by(group: Path, most: str, used: str, kept: str) -> int:
 def _text(path: Path) -> str:
     """The text of a file, "" where it cannot be read."""
     try:
-        return path.read_text()
+        return path.read_text(encoding="utf-8")
     except OSError:
         return ""
 

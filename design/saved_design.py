@@ -78,7 +78,7 @@ def write_design(path: Path, design: FoundDesign, *, colonies: float) -> Path:
             "losses": design.searched.tolist(),
         },
     }
-    path.write_text(json.dumps(saved, indent=1, default=_plain) + "\n")
+    path.write_text(json.dumps(saved, indent=1, default=_plain) + "\n", encoding="utf-8")
     return path
 
 
@@ -130,7 +130,7 @@ def read_design(path: Path) -> dict[str, Any]:
     """The content of a file with the parameters of a design. Raises InputError for any other
     file."""
     try:
-        found = json.loads(path.read_text())
+        found = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(found, dict) or not isinstance(found["parameters"], dict):
             raise TypeError("its parameters are no table")
         _check_content(found)

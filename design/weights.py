@@ -25,7 +25,9 @@ def save_weights(module: torch.nn.Module, path: str | Path) -> Path:
         flat = value.detach().cpu().double().flatten().tolist()
         kind = str(value.dtype).removeprefix("torch.")
         stored[name] = {"dtype": kind, "shape": list(value.shape), "values": flat}
-    path.write_text(json.dumps({"format": FORMAT, "weights": stored}, indent=1) + "\n")
+    path.write_text(
+        json.dumps({"format": FORMAT, "weights": stored}, indent=1) + "\n", encoding="utf-8"
+    )
     return path
 
 
@@ -54,7 +56,7 @@ def _check_module(module: object) -> None:
 
 def _read(path: Path) -> dict[str, Tensor]:
     try:
-        found = json.loads(path.read_text())
+        found = json.loads(path.read_text(encoding="utf-8"))
         if found["format"] != FORMAT:
             raise ValueError(f"its format is {found['format']!r}")
         return {

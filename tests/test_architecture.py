@@ -252,6 +252,39 @@ def test_design_uses_public_names_only():
     assert wrong == []
 
 
+NO_TEXT = ("os", "Image", "Study")  # whose `open` opens no text
+
+
+def _opens_without_encoding(node: ast.AST) -> bool:
+    """Whether this is a call that reads or writes text as the locale has it."""
+    if not isinstance(node, ast.Call) or any(k.arg == "encoding" for k in node.keywords):
+        return False
+    called, words = (
+        node.func,
+        [ast.unparse(x) for x in (*node.args, *(k.value for k in node.keywords))],
+    )
+    if isinstance(called, ast.Attribute):
+        if called.attr in ("read_text", "write_text"):
+            return True
+        opens = called.attr == "open" and ast.unparse(called.value) not in NO_TEXT
+    else:
+        opens = isinstance(called, ast.Name) and called.id == "open"
+    return opens and not any(re.fullmatch(r"'[rwax+]*b[rwax+]*'", word) for word in words)
+
+
+def test_text_is_utf8_in_every_locale():
+    """Files of torchfilm have letters beyond ASCII; on Windows, and in the C locale, Python opens
+    text in another encoding."""
+    files = [f for room in ("torchfilm", "design") for f in sorted((ROOT / room).rglob("*.py"))]
+    found = [
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for path in files
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if _opens_without_encoding(node)
+    ]
+    assert found == []
+
+
 def test_public_names_exist():
     assert [name for name in torchfilm.__all__ if not hasattr(torchfilm, name)] == []
     assert len(set(torchfilm.__all__)) == len(torchfilm.__all__)

@@ -65,6 +65,13 @@ def test_an_export_stops_while_its_file_can_be_closed(results, monkeypatch):
     assert [*results.parent.iterdir()] == [results]
 
 
+def test_a_circuit_in_the_c_locale(tmp_path):
+    """Where Python opens text as ASCII: the code that is made for a circuit has other letters."""
+    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = shell("explain", "boundary_detector", folder=tmp_path, environment=plain)
+    assert done.returncode == 0, done.stderr
+
+
 def test_a_study_on_a_full_disk(tmp_path, monkeypatch):
     target = design.Stripe("yfp", at=6.0, width=4.0)
     space = [design.Parameter("k1", 0.1, 10.0, log=True)]

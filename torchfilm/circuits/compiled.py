@@ -319,9 +319,9 @@ def _module(text: str) -> ModuleType:
         exec(compile(text, name, "exec"), module.__dict__)
         return module
     file = FOLDER / f"{name}.py"
-    if not file.exists() or file.read_text() != text:
+    if not file.exists() or file.read_text(encoding="utf-8") != text:
         draft = file.with_suffix(f".{os.getpid()}")
-        draft.write_text(text)
+        draft.write_text(text, encoding="utf-8")
         draft.replace(file)
     spec = importlib.util.spec_from_file_location(f"torchfilm.kernels.{name}", file)
     assert spec is not None and spec.loader is not None

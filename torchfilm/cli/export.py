@@ -152,7 +152,7 @@ class Export:
     def _newick(self, results: Results) -> list[Path]:
         path, text = self._new(results, NEWICK), results.lineage().to_newick(self._one())
         with written_whole(path) as beside:
-            beside.write_text(text)
+            beside.write_text(text, encoding="utf-8")
         return [path]
 
     def _graph(self, results: Results) -> list[Path]:

@@ -154,7 +154,7 @@ def design(what: str) -> dict[str, Any]:
     if not path.is_file():
         raise checks.input_error("scene", what, "the path of a saved design", "No such file.")
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{what} cannot be read as JSON: {error}.") from error
     if (

@@ -38,7 +38,7 @@ def _quota(groups: Path) -> float:
     where there is no limit. More threads would have to wait for each other."""
     for names in (["cpu.max"], ["cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us"]):
         try:
-            words = " ".join((groups / name).read_text() for name in names).split()
+            words = " ".join((groups / name).read_text(encoding="utf-8") for name in names).split()
         except OSError:
             continue
         if len(words) == 2 and all(word.isdigit() for word in words) and int(words[1]) > 0:

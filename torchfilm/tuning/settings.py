@@ -78,7 +78,9 @@ class Settings(metaclass=checks.KnownKeywords):
         path = Path(path)
         Settings.check_new(path)
         try:
-            path.write_text(json.dumps({"format": FORMAT, **self.given}, indent=1) + "\n")
+            path.write_text(
+                json.dumps({"format": FORMAT, **self.given}, indent=1) + "\n", encoding="utf-8"
+            )
         except OSError as error:
             raise checks.input_error(
                 "path", str(path), "a file that can be written", f"{error.strerror}."
@@ -100,7 +102,7 @@ class Settings(metaclass=checks.KnownKeywords):
     def load(path: str | Path) -> Settings:
         """Reads a file that `save` wrote. Raises InputError for any other file."""
         try:
-            found = json.loads(Path(path).read_text())
+            found = json.loads(Path(path).read_text(encoding="utf-8"))
         except OSError as error:
             raise checks.InputError(
                 f"{path} cannot be read: {error.strerror}. `torchfilm tune SCENE --out FILE` writes"
