@@ -209,6 +209,24 @@ def test_kernels_that_nobody_uses_are_removed(tmp_path, monkeypatch):
     assert (home / "kernels-used").exists()
 
 
+def test_only_a_folder_of_the_user_keeps_kernels(tmp_path, monkeypatch):
+    """None that goes by the current directory: a relative XDG_CACHE_HOME is to be ignored, and
+    without a home "~" stays as it is."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("XDG_CACHE_HOME", "cache")
+    found = compiling.cache_folder()
+    assert found.parent == tmp_path / "home" / ".cache" / "torchfilm"
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)
+    assert compiling.cache_folder() is None
+    assert [f.name for f in tmp_path.iterdir()] == ["home"]
+
+
+def test_a_place_may_have_a_name_that_is_no_text(monkeypatch):
+    monkeypatch.setattr(compiling, "__file__", os.fsdecode(b"/\xff/compiling.py"))
+    assert len(compiling._digest()) == 16
+
+
 def test_kernels_that_cannot_be_removed_stay(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     unused = tmp_path / "torchfilm" / "kernels-unused"

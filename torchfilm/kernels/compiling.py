@@ -43,7 +43,8 @@ UNREADABLE = (EOFError, pickle.UnpicklingError)
 def _digest() -> str:
     """A name for this version of the kernels, at this place: Numba looks at the file of a function
     only, not at the functions that it calls."""
-    found = hashlib.sha256(f"{numba.__version__} {Path(__file__).parent} {OVERWRITES}".encode())
+    place = f"{numba.__version__} {Path(__file__).parent} {OVERWRITES}"
+    found = hashlib.sha256(os.fsencode(place))  # names of folders may be no text
     for file in sorted(Path(__file__).parent.glob("*.py")):
         found.update(file.read_bytes())
     return found.hexdigest()[:16]
@@ -53,17 +54,22 @@ def _digest() -> str:
 KEPT_DAYS = 30
 
 
-def _wanted_folder() -> Path:
-    """The user's own cache of torchfilm."""
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    return Path(home) / "torchfilm"
+def _wanted_folder() -> Path | None:
+    """The user's own cache of torchfilm; None for a user who has no home."""
+    given, home = os.environ.get("XDG_CACHE_HOME", ""), os.path.expanduser("~")
+    # (by its specification a relative path is to be ignored)
+    cache = given if os.path.isabs(given) else os.path.join(home, ".cache")
+    return Path(cache) / "torchfilm" if os.path.isabs(cache) else None
 
 
 def cache_folder() -> Path | None:
     """Where compiled kernels are kept, or None where nothing can be written: the user's own cache,
     since compiled code that others could write must never be loaded. A new version removes what
     older ones left and nobody uses."""
-    folder = _wanted_folder() / f"kernels-{_digest()}"
+    wanted = _wanted_folder()
+    if wanted is None:
+        return None
+    folder = wanted / f"kernels-{_digest()}"
     try:
         new = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
@@ -140,8 +146,8 @@ def first_call(name: str, what: str) -> Iterator[None]:
         yield
         return
     remedy = (
-        f", since it cannot be kept in {_wanted_folder()}: set XDG_CACHE_HOME to a folder that can"
-        " be written"
+        f", since it cannot be kept in {_wanted_folder() or 'a home folder, which you lack'}: set"
+        " XDG_CACHE_HOME to a folder that can be written"
     )
     why = remedy if FOLDER is None else ""
     print(f"torchfilm: compiling {what}, {HOW_OFTEN}{why}", file=sys.stderr)
@@ -164,7 +170,7 @@ def _alone(name: str) -> Iterator[None]:
         return
     with ExitStack() as held:
         try:
-            file = held.enter_context((FOLDER / f"{name}.lock").open("w"))
+            file = held.enter_context((FOLDER / f"{name}.lock").open("wb"))
             fcntl.flock(file, fcntl.LOCK_EX)
             # not only closed: a process that was forked meanwhile has the file open, too
             held.callback(fcntl.flock, file, fcntl.LOCK_UN)

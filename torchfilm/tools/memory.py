@@ -20,8 +20,8 @@ def keep_memory() -> bool:
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError):
-        return False  # another C library
+    except (AttributeError, OSError, TypeError):
+        return False  # another C library; none without a name on Windows
     return all(
         [
             mallopt(M_MMAP_THRESHOLD, LARGEST_MMAP_THRESHOLD),
