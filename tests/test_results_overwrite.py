@@ -237,6 +237,19 @@ def test_where_an_open_file_cannot_be_renamed(old, whole, monkeypatch):
     only(old)
 
 
+def test_whoever_has_the_file_open_is_asked_to_close_it(old, monkeypatch):
+    """Windows does not replace it then; it may be this process that has not closed its results."""
+
+    def refuse(*_):
+        raise PermissionError
+
+    monkeypatch.setattr(replacing, "RENAMES_OPEN_FILES", False)
+    monkeypatch.setattr(replacing.os, "replace", refuse)
+    scene = make_scene()
+    with pytest.raises(tf.InputError, match=r"run\.h5.*nothing has open.*results\.close\(\)"):
+        record(scene, scene.bind(3).start(), old, overwrite=True)
+
+
 def test_a_place_where_hdf5_cannot_create_a_file_is_named(tmp_path, monkeypatch):
     def locked(*_, **__):
         raise OSError(95, "unable to lock file")

@@ -46,3 +46,9 @@ def test_names_that_are_nearly_right_get_the_right_one(call, message):
 
 def test_nothing_is_suggested_for_what_is_no_name():
     assert checks.suggestion(3, ["a"]) == checks.suggestion("zebra", ["rate", 5]) == ""
+
+
+def test_how_to_install_an_extra_depends_on_where_torchfilm_is(tmp_path, monkeypatch):
+    assert checks.install("app") == 'pip install -e ".[app]" in the folder of torchfilm'
+    monkeypatch.setattr(checks, "__file__", str(tmp_path / "torchfilm" / "tools" / "checks.py"))
+    assert checks.install("app") == 'pip install "torchfilm[app]"'

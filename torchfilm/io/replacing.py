@@ -131,8 +131,9 @@ def put_in_place(file: h5py.File, source: Path, path: Path) -> h5py.File:
         raise checks.input_error(
             "record",
             str(path),
-            "a file that no other process has open",
-            "This operating system cannot replace an open file. Close it there.",
+            "a file that nothing has open",
+            "This operating system cannot replace an open file. Close it in the other process, or"
+            " here: results.close(), or `with tf.Results(…) as results:`.",
         ) from error
     file = h5py.File(path, "r+", libver="latest")
     file.swmr_mode = True

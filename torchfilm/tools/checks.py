@@ -43,8 +43,11 @@ def input_error(name: str, value: object, allowed: str, hint: str = "") -> Input
 
 
 def install(extra: str) -> str:
-    """How to install an extra of torchfilm, which is on no package index, for messages."""
-    return f'pip install -e ".[{extra}]" in the folder of torchfilm'
+    """How to install an extra of torchfilm, which is on no package index, for messages: from its
+    folder where it runs from there, else beside what is installed."""
+    if (Path(__file__).parents[2] / "pyproject.toml").exists():
+        return f'pip install -e ".[{extra}]" in the folder of torchfilm'
+    return f'pip install "torchfilm[{extra}]"'
 
 
 def nearest(given: str, known: Iterable[str]) -> str | None:
