@@ -88,8 +88,7 @@ class Stripe(ProfileTarget):
                 "Stripe: the cells have no types. Give types to the founders:"
                 " founders=tf.Cells(…, cell_type=[0, 1])."
             )
-        for k in range(state.colonies):
-            there = torch.unique(state.cell_type[state.colony == k]).tolist()
+        for k, there in enumerate(_types(state)):
             if self.at == "border" and len(there) != 2:
                 hint = "Give the founders two types, or give at= a place in µm."
                 raise tf.InputError(
@@ -112,8 +111,7 @@ class Stripe(ProfileTarget):
         if self.at != "border" and self.cell_type is None:
             return [""] * state.colonies
         out = []
-        for k in range(state.colonies):
-            there = torch.unique(state.cell_type[state.colony == k]).tolist()
+        for there in _types(state):
             if self.at == "border" and len(there) != 2:
                 out.append(f"it has no border: only cells of type {there} are left")
             elif self.cell_type is not None and self.cell_type not in there:
@@ -263,6 +261,15 @@ def _axis(state: tf.State, along: str) -> Tensor:
     return state.position.detach()[:, "xy".index(along)].double()
 
 
+def _types(state: tf.State) -> list[list[int]]:
+    """The types of cells that are in each colony, ascending."""
+    pairs = torch.unique(torch.stack([state.colony, state.cell_type], 1), dim=0)
+    found: list[list[int]] = [[] for _ in range(state.colonies)]
+    for colony, kind in pairs.tolist():
+        found[colony].append(kind)
+    return found
+
+
 @torch.no_grad()
 def _from_border(state: tf.State, low_type: Tensor) -> Tensor:
     """The distance of each cell to the nearest cell of the other type, (N,) float64 µm: seen from
@@ -270,12 +277,13 @@ def _from_border(state: tf.State, low_type: Tensor) -> Tensor:
     lower on the axis, and NaN where there is no other type."""
     position, kind = state.position.detach()[:, :2], state.cell_type
     found = torch.full((state.cells,), math.nan, dtype=torch.float64, device=state.device)
-    start = 0
-    for count in state.counts.tolist():
-        mine = torch.arange(start, start + count, device=state.device)
-        start += count
-        of_one = kind[mine] == kind[mine].min() if count else mine.bool()
-        one, other = mine[of_one], mine[~of_one]
+    of_one = kind == (-state.groups.max(-kind)).index_select(0, state.colony)
+    # the cells of each colony, those of its first type first
+    order = torch.argsort(2 * state.colony + (~of_one).long(), stable=True)
+    firsts = state.groups.sum(of_one.double().unsqueeze(1)).squeeze(1).long()
+    sizes = torch.stack([firsts, state.counts - firsts], 1)
+    parts = order.split(sizes.flatten().tolist())  # the one read
+    for one, other in zip(parts[::2], parts[1::2], strict=True):
         if not other.numel():
             continue
         for these, those in ((one, other), (other, one)):

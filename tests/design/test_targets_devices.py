@@ -9,9 +9,10 @@ import pytest
 import torch
 from mock_cuda import pretended_cuda  # noqa: F401
 from patterned import crowded
+from test_host_reads import Reads
 
 from design import Observed
-from design.targets import DomainSize, Oscillation
+from design.targets import DomainSize, Oscillation, Stripe
 
 TIMES = torch.arange(60, dtype=torch.float64) * 0.1
 
@@ -37,3 +38,16 @@ def test_losses_are_those_of_the_cpu(pretended_cuda, kind):  # noqa: F811
     right = target.measures(here, history)
     for name, value in target.measures(there, history.to("cuda")).items():
         assert torch.allclose(value.cpu(), right[name], rtol=1e-12, equal_nan=True), name
+
+
+@pytest.mark.parametrize("straight", [True, False])
+def test_a_stripe_reads_as_often_for_many_colonies(pretended_cuda, monkeypatch, straight):  # noqa: F811
+    """A read waits for the GPU: there is none for each colony."""
+    target, counts = Stripe("yfp", width=4.0, straight=straight), []
+    for colonies in (2, 6):
+        there = crowded(colonies=colonies).to("cuda")
+        with monkeypatch.context() as patch, Reads(patch) as reads:
+            for look in (target.check, target.unfit, target.loss):
+                look(there)
+        counts.append(reads.count)
+    assert 0 < counts[0] == counts[1]
