@@ -16,6 +16,7 @@ from mock_cuda import pretended_cuda  # noqa: F401
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchfilm as tf
+from torchfilm.loop import LastingConcerns
 
 # How often CUDA's own code reads in an operation; of `bincount` the least and the greatest.
 READS = {
@@ -117,6 +118,19 @@ SCENES = {
     "bilateral contacts": (lambda: tf.Scene(*colony("bilateral"), dt=0.025), 21),
     "a circuit with a signal": (signalling, 221),
 }
+
+
+@torch.no_grad()
+def test_all_reports_are_read_at_once(pretended_cuda, monkeypatch):  # noqa: F811
+    """By the monitors of a run: once for failures, and once for concerns."""
+    scene = signalling()
+    model = scene.bind(2, device="cuda")
+    state = model.step(model.start(), scene.dt)
+    assert len(state.reports) > 2
+    for look in (tf.failures, LastingConcerns()):
+        with monkeypatch.context() as patch, Reads(patch) as reads:
+            look(state)
+        assert reads.count == 1
 
 
 @cache

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchfilm.reports import Concern, Report
 from torchfilm.state import State
 from torchfilm.tools.checks import SimulationError
+from torchfilm.tools.reads import numbers
 from torchfilm.tools.warn_once import warn
 
 Step = Callable[[State], State]
@@ -98,9 +99,11 @@ def failures(state: State) -> list[Failure]:
     cell too short to divide, a circuit whose rates are not finite. The reports are those of
     `torchfilm.reports.Report`."""
     found = []
-    report: Report
-    for report in state.reports.values():
-        if not bool(report.status.any()):
+    reports: list[Report] = list(state.reports.values())
+    # a report of an effect of a user's may be on another device
+    failed = numbers(*(report.status.any().to(state.device) for report in reports))
+    for report, some in zip(reports, failed, strict=True):
+        if not some:
             continue
         for place in torch.nonzero(report.status).squeeze(1).tolist():
             id_, cells = int(state.colony_id[place]), int(state.counts[place])
@@ -203,15 +206,20 @@ class LastingConcerns:
         self.warned: set[tuple[str, str]] = set()
 
     def __call__(self, state: State) -> None:
-        for title, report in state.reports.items():
-            for concern in report.concerns() if hasattr(report, "concerns") else ():
-                self._look(state, (title, concern.name), concern)
+        asked = {
+            (title, concern.name): concern
+            for title, report in state.reports.items()
+            for concern in (report.concerns() if hasattr(report, "concerns") else ())
+            if (title, concern.name) not in self.warned
+        }
+        held = numbers(*(concern.where.any().to(state.device) for concern in asked.values()))
+        for (key, concern), some in zip(asked.items(), held, strict=True):
+            self._look(state, key, concern, bool(some))
 
-    def _look(self, state: State, key: tuple[str, str], concern: Concern) -> None:
-        if key in self.warned:
-            return
+    def _look(self, state: State, key: tuple[str, str], concern: Concern, some: bool) -> None:
+        """some: whether it holds in any colony."""
         before, ids = self.steps.get(key, {}), state.colony_id
-        here = ids[concern.where].tolist() if bool(concern.where.any()) else []
+        here = ids[concern.where].tolist() if some else []
         now = self.steps[key] = {k: before.get(k, 0) + 1 for k in here}
         long = [k for k, steps in now.items() if steps >= concern.steps]
         if not long:

@@ -120,3 +120,12 @@ def test_poisson_bits_do_not_depend_on_company():
         torch.cat([poisson(mean[k : k + 1], u[k : k + 1]) for k in range(400)]), whole
     )
     assert torch.equal(poisson(mean.reshape(4, 100), u.reshape(4, 100)).reshape(-1), whole)
+
+
+def test_codes_are_copied_to_a_device_once(monkeypatch):
+    """A copy to a GPU for each draw would wait in its queue."""
+    rows = torch.arange(3)
+    draw = KeyedDraws(1, rows, rows, 0, "codes")
+    first = draw(rows, 0, "once", 3)
+    monkeypatch.setattr(torch, "tensor", None)
+    assert torch.equal(draw(rows, 0, "once", 3), first)

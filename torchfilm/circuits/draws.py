@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import torch
 from torch import Tensor
@@ -47,7 +47,7 @@ class KeyedDraws:
     def __call__(self, rows: Tensor, event: int, what: str, count: int) -> Tensor:
         own, cell = self.stream.index_select(0, rows), self.uid.index_select(0, rows)
         pairs = (count + 1) // 2
-        codes = torch.tensor(self.codes(what, pairs), device=rows.device).unsqueeze(1)
+        codes = _codes_on(rows.device, self.codes(what, pairs))
         # The event number shares a word with the upper half of the uid. They stay apart for uids
         # below 2⁴⁸. Beyond 65,535 events the code takes the rest of the event number.
         codes = (codes ^ (((event + 1) >> 16) * 0x9E3779B9)) & MASK
@@ -70,6 +70,12 @@ class KeyedDraws:
 @cache
 def _codes(what: str, pairs: int) -> tuple[int, ...]:
     return tuple(purpose_code(f"{what} {k}") for k in range(pairs))
+
+
+@lru_cache(maxsize=1000)
+def _codes_on(device: torch.device, codes: tuple[int, ...]) -> Tensor:
+    """The codes as a column there, copied to a GPU once."""
+    return torch.tensor(codes, device=device).unsqueeze(1)
 
 
 def poisson(mean: Tensor, uniform: Tensor) -> Tensor:

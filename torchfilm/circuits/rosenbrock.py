@@ -99,7 +99,9 @@ def rodas3(
     if cells == 0 or species == 0 or dt == 0:
         none = torch.zeros(cells, dtype=torch.int64, device=u.device)
         return u.clone(), RosenbrockReport(none, none, none)
-    scale = torch.as_tensor(atol, dtype=torch.float64, device=u.device).reshape(-1, 1)
+    # (a number is filled in there, and not copied from the host)
+    given = whole.new_full((), atol) if isinstance(atol, (int, float)) else atol
+    scale = torch.as_tensor(given, dtype=torch.float64, device=u.device).reshape(-1, 1)
     one = torch.zeros(1, dtype=torch.int64, device=u.device)
     tracked = torch.is_grad_enabled() and (
         u.requires_grad or rates(u.index_select(0, one), one).requires_grad

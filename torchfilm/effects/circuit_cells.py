@@ -26,7 +26,7 @@ def cell_column(state: State, name: str) -> Tensor:
         return state.position[:, "xyz".index(name)].to(state.dtype)
     if name == "colony":
         return state.own_colony_id
-    return state.length.new_tensor(state.time) if name == "time" else state.fields[name]
+    return state.length.new_full((), state.time) if name == "time" else state.fields[name]
 
 
 def cells_of_type(state: State, kind: Kind) -> Tensor:

@@ -239,13 +239,15 @@ class _CellGrid:
         place, reach = place.index_select(1, members), reach.index_select(0, members)
         reaches = 2 if own.shape[0] == 1 else 1
         starts, counts = [], []
-        for step in itertools.product(range(-reaches, reaches + 1), repeat=own.shape[0]):
+        steps = [
+            step
+            for step in itertools.product(range(-reaches, reaches + 1), repeat=own.shape[0])
             # a film one row thick has no rows above or below
-            if step[::-1] < (0,) * len(step) or any(
-                abs(k) >= rows for k, rows in zip(step, self.most_rows, strict=True)
-            ):
-                continue
-            offset = torch.tensor(step, device=own.device).unsqueeze(1)
+            if step[::-1] >= (0,) * len(step)
+            and all(abs(k) < rows for k, rows in zip(step, self.most_rows, strict=True))
+        ]
+        shifts = torch.tensor(steps, device=own.device).unsqueeze(2)  # one copy to the device
+        for step, offset in zip(steps, shifts, strict=True):
             start, count = self._range_in_row(members, own + offset)
             if not any(step):
                 stop = start + count
