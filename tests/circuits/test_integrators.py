@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 import torch
 from helpers import array
-from mock_cuda import Pretended, pretended_cuda  # noqa: F401
-from torchdiffeq import odeint
 
 import torchfilm as tf
 from torchfilm.circuits.integrators import euler, runge_kutta
@@ -58,24 +56,6 @@ def test_a_row_is_its_own(device, dtype, method):
     for k in ([0], [36], list(range(36, -1, -1)), [5, 11, 3, 20, 7]):
         k = torch.tensor(k, device=device)
         assert torch.equal(run(k), whole[k])
-
-
-@pytest.mark.parametrize("method", [m for m in METHODS if m != "euler"])
-def test_bits_are_those_of_torchdiffeq(dtype, method):
-    u = torch.rand(37, 3, generator=torch.Generator().manual_seed(1)).to(dtype) * 3 - 1
-    grid = torch.linspace(0.0, 0.7, 6, dtype=F64)
-    rates = lambda t, u: logistic(u, None) * torch.exp(u)
-    options = {"grid_constructor": lambda *_: grid}
-    right = odeint(rates, u, grid[[0, -1]], method=method, options=options)[-1]
-    assert torch.equal(runge_kutta(lambda u, _: rates(None, u), u, 0.7, 5, method), right)
-
-
-@pytest.mark.parametrize("method", [m for m in METHODS if m != "euler"])
-def test_steps_do_not_read_from_a_gpu(pretended_cuda, monkeypatch, method):  # noqa: F811
-    for name in ("__bool__", "__float__", "item", "tolist"):
-        monkeypatch.setattr(Pretended, name, None)
-    start = torch.rand(5, 2, device="cuda")
-    assert METHODS[method][1](logistic, start, 0.7, steps=3).device.type == "cuda"
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -1,6 +1,6 @@
 """The text of the methods with equal steps, `integrators`, cell by cell.
 
-The order of operations is theirs, and so is the type of numbers: that of the state.
+The order of operations is that of torchdiffeq, and so is the type of numbers: that of the state.
 """
 
 from __future__ import annotations
