@@ -42,7 +42,7 @@ def runge_kutta(rates: Rates, u: Tensor, dt: float, steps: int = 1, method: str 
     )  # imported where it is used: it takes longer to load than torchfilm itself
 
     rows = torch.arange(u.shape[0], device=u.device)
-    grid = _grid(dt, steps)
+    grid = _grid(dt, steps).to(u.device)  # odeint would move it, and warn
     found = odeint(
         lambda t, y: rates(y, rows),
         u,
