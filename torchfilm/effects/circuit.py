@@ -296,9 +296,8 @@ class Circuit(Effect):
         """Its equations by cell type."""
         found = {}
         for kind, part in self.rates.items():
-            label = label_of(part)
+            label, names = label_of(part), (tuple(self.variables), tuple(self.parameters))
             try:
-                names = tuple(self.variables), tuple(self.parameters)
                 found[kind] = graph_of(part, *names, label, left_out(self))
             except Untraceable as why:
                 raise checks.InputError(
