@@ -17,6 +17,7 @@ from torchfilm.founders import Draw, one_draw
 from torchfilm.initial_cells import Cells
 from torchfilm.model import Model, bind
 from torchfilm.parameters import given, parameters, summary
+from torchfilm.rule_views import OF_EFFECTS
 from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.hashing import digest, without_addresses
@@ -319,14 +320,19 @@ def _check_fields(effects: Sequence[Effect], dim: int, founders: Cells) -> dict[
                 raise checks.InputError(
                     f"{effect.title} needs the field {name!r}, which nothing in this scene"
                     f" provides. It has: {', '.join(declared) or 'no field'}."
-                    + (
-                        _signal_hint(name.removeprefix(OUTSIDE), declared)
-                        if name.startswith(OUTSIDE)
-                        else f" A variable of rules needs a first value for it: tf.Rules(…,"
-                        f" variables={{{name!r}: 1.0}})."
-                    )
+                    + _lacking_hint(name, declared)
                 )
     return names
+
+
+def _lacking_hint(name: str, declared: Iterable[str]) -> str:
+    """What to do where an effect needs a field that nothing provides."""
+    if name.startswith(OUTSIDE):
+        return _signal_hint(name.removeprefix(OUTSIDE), declared)
+    if name in OF_EFFECTS:
+        return f" List {OF_EFFECTS[name]} beside it."
+    first = f"tf.Rules(…, variables={{{name!r}: 1.0}})"
+    return f" A variable of rules needs a first value for it: {first}."
 
 
 def _kept_twice(effect: Effect, value: str, field: str, other: str) -> str:

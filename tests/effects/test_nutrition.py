@@ -369,3 +369,9 @@ def test_rules_that_set_the_rate_of_a_fed_cell_are_refused():
         )  # fmt: skip
         with pytest.raises(tf.InputError, match=words):
             scene.bind()
+
+
+def test_growth_is_asked_for_where_it_is_missing():
+    medium = tf.Medium(food=tf.Signal(diffusion=1.0), box=((-8, -8), (8, 8)), spacing=4.0)
+    with pytest.raises(tf.InputError, match=r"needs the field 'growth_rate'.*List tf.Growth\(\)"):
+        tf.Scene(tf.Monod("food"), medium, dim=2)
