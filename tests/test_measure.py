@@ -243,6 +243,8 @@ def test_strains_and_heterozygosity():
     wanted = tf.measure.strains(state, kinds=[*found, 77])
     assert all(torch.equal(wanted[k], found[k]) for k in found)
     assert wanted[77].tolist() == [0] * state.colonies
+    below = state.with_fields(cell_type=-state.cell_type)
+    assert set(tf.measure.strains(below)) == {-k for k in found}
     assert {k: v.tolist() for k, v in found.items()} == {
         0: [2, 0, 0], 1: [1, 3, 0], 4: [1, 0, 0],
     }  # fmt: skip

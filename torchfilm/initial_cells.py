@@ -56,12 +56,12 @@ class Cells(metaclass=checks.KnownKeywords):
             )
         count = position.shape[0]
         axis = _array("axis", self.axis, np.float64)
-        # of two cells in the plane, two numbers may be angles, unless they are a unit vector
-        clear = count == 1 or axis.shape != (count,) or abs((axis**2).sum() - 1.0) < 1e-3
-        if axis.shape == position.shape[1:] and clear:
+        # for two cells in the plane two numbers may be angles, unless they are a unit vector
+        angles = axis.shape == (2,) == (count,) and abs((axis**2).sum() - 1.0) >= 1e-3
+        if axis.shape == position.shape[1:] and not angles:
             axis = np.broadcast_to(axis, position.shape)
         if axis.shape != position.shape:
-            given = f"an array of shape {axis.shape}"
+            given = f"{axis.tolist()} for two cells" if angles else f"an array of {axis.shape}"
             rule = f"of shape {position.shape}, like position"
             raise checks.input_error("Cells.axis", given, rule, self.instead["angle"])
         size = np.sqrt((axis**2).sum(1))

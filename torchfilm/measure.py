@@ -223,9 +223,8 @@ def strains(
     among them."""
     kind = _kinds("strains", state, name)
     count = lambda k: torch.bincount(state.colony[kind == k], minlength=state.colonies)
-    if kinds is None:
-        kinds = [int(k) for k in kind.unique().tolist()]
-    return {checks.integer("kinds", k, least=0): count(k) for k in kinds}
+    wanted = kind.unique().tolist() if kinds is None else kinds
+    return {checks.integer("kinds", k, least=-(2**63)): count(k) for k in wanted}
 
 
 @of_a_state

@@ -287,7 +287,7 @@ class Model:
     def growth_fingerprint(self) -> str:
         """A word that is equal for models that grow alike, and for no others."""
         recorded = [self.scene.effects[k] for k in self.recorded]
-        return digest(recorded, self.scene.drawn_from, self.dim)
+        return digest(recorded, self._begin.given or self.scene.drawn_from, self.dim)
 
     @cached_property
     def why_not_replayable(self) -> str:

@@ -387,6 +387,9 @@ def slowed(cells):
     cells.vigour = torch.where(cells.cell_type == 1, 0.5, 1.0)
 
 
+VIGOUR = tf.Rules(slowed, variables={"vigour": 1.0})
+
+
 def pair(*effects: tf.Effect) -> tf.Scene:
     cells = tf.Cells([[0.0, 0.0], [9.0, 0.0]], [[1.0, 0.0]] * 2, cell_type=[0, 1])
     return tf.Scene(*effects, founders=cells)
@@ -419,9 +422,24 @@ def test_a_circuit_stops_growth():
     assert gained == pytest.approx(1 - math.exp(-2.0), rel=0.01)
 
 
+def eaten() -> list[tf.Effect]:
+    food = tf.Signal(diffusion=1e3, initial=1.0)
+    return [tf.Monod("food"), tf.Medium(food=food, box=((-16, -16), (16, 16)), spacing=4.0)]
+
+
+def still() -> tf.Scene:
+    cells = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], extra={"v": [0.0]})
+    return tf.Scene(tf.Growth(rate=1.0, factor="v"), tf.Division(length=4.0), founders=cells)
+
+
 @pytest.mark.parametrize(
     ("build", "said"),
     [
+        (
+            lambda: pair(tf.Growth(factor="vigour"), VIGOUR, *eaten()).bind(),
+            r"Growth.factor = 'vigour' would let them grow by less.*tf.Monod\(…, factor='vigour'\)",
+        ),
+        (lambda: next(iter(tf.simulate(still(), cells=4))), r"waits for 'v', .*a factor above 0"),
         (lambda: tf.Growth(rate=1.0, factor=2.0), r"Growth.factor = 2.0 .*name of a variable"),
         (
             lambda: tf.Growth(species="a", factor="b"),
@@ -429,7 +447,7 @@ def test_a_circuit_stops_growth():
         ),
         (
             lambda: pair(tf.Growth(rate=1.0, factor="vigor")).bind().start(),
-            r"Growth.factor = 'vigor' .*a species of a circuit, or a variable .*There are: ",
+            r"growth needs the field 'vigor', which nothing in this scene provides",
         ),
         (
             lambda: (

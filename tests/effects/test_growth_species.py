@@ -145,16 +145,20 @@ PACE = lambda u, s, p, cell: {"grown": 1.0}
             r"growth does not dilute this species.*Leave out Circuit.dilution",
         ),
         (
-            lambda: tf.Scene(tf.Growth(species="grwn"), dim=2).bind().start(),
-            r"Growth.species = 'grwn' .*a species of a circuit.*There are: ",
+            lambda: tf.Scene(tf.Growth(species="grwn"), dim=2),
+            r"growth needs the field 'grwn', which nothing in this scene provides",
         ),
         (
             lambda: tf.Scene(
                 tf.Growth(species="food_eaten"), tf.Monod("food"),
                 tf.Medium(food=tf.Signal(diffusion=1.0), box=((-8, -8), (8, 8)), spacing=4.0),
                 dim=2,
-            ),
+            ).bind(),
             r"nutrition sets growth_rate, and Growth.species = 'food_eaten' sets it again",
+        ),
+        (
+            lambda: scene(tf.Rules(lambda cells: setattr(cells, "growth_rate", 0.0))).bind(2),
+            r"rules sets growth_rate, and Growth.species = 'grown' sets it again",
         ),
     ],
 )  # fmt: skip

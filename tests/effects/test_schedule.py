@@ -315,6 +315,28 @@ def test_the_time_of_a_change_is_told():
     assert "source of food changes at 0.5 h and every 1 h anew" in str(tf.explain(scene))
 
 
+def test_a_change_at_a_part_of_a_step_is_followed():
+    """Circuits take the middle of each part."""
+    rates = lambda u, s, p, cell: ({"dye": p.light * s.food}, {"food": -0.1 * s.food * cell.volume})
+    light = tf.Schedule({0: 1.0, 0.05: 3.0, 0.1: 0.0})
+    ends = []
+    for dt, steps in ((0.1, 2), (0.05, 1)):
+        circuit = tf.Circuit(rates, species="dye", light=light)
+        box = tf.Medium(food=tf.Signal(diffusion=100.0, initial=0.5), steps=steps, **BOX)
+        ends.append(float(runs(tf.Scene(circuit, box, dim=2), 0.1, dt=dt).dye))
+    assert ends[0] == pytest.approx(ends[1], rel=1e-3)
+
+
+def test_a_lost_dose_of_a_rule_is_warned_of():
+    def take(cells):
+        cells.got = cells.got + cells.p.dose * cells.dt
+
+    dose = {"dose": tf.Schedule({0: 0.0, 0.51: 5.0, 0.52: 0.0})}
+    rules = tf.Rules(take, variables={"got": 0.0}, parameters=dose)
+    with pytest.warns(UserWarning, match=r"Rules.dose has the value of 0.51 h in no step"):
+        runs(tf.Scene(rules, dim=2), 0.1)
+
+
 def test_a_change_within_a_step_is_warned_of():
     scene = grown(medium(tf.Schedule({0: 1.0, 0.52: 0.0}), "source"))
     with pytest.warns(UserWarning, match=r"source of food changes at 0\.52 h, within a step"):

@@ -25,7 +25,7 @@ from torchfilm.circuits.tracing import Untraceable
 from torchfilm.circuits.trial import try_circuit
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.circuit_cells import Kind, cell_column, cell_names, cells_of_type
-from torchfilm.effects.circuit_checks import check_read, schedules_of
+from torchfilm.effects.circuit_checks import check_read, check_schedules, schedules_of
 from torchfilm.effects.circuit_kernels import CircuitKernels, PreparedStep, Taken
 from torchfilm.effects.circuit_report import Failures
 from torchfilm.effects.circuit_words import methods_of, together_lines
@@ -232,10 +232,16 @@ class BoundCircuit(BoundEffect):
         lines = methods_of(self.effect, dt, self.plan.turns, self._why_torch(), exchanged)
         lines += [f"{n} {x.told}" for n, x in schedules_of(self.effect).items()]
         if transport:
-            dt = dt / transport.medium.steps
-            rates = {n: transport.exchanges_per_hour(n, state) for n in self.exchanges()}
-            lines += together_lines({n: x * dt for n, x in rates.items()})
+            dt, each = dt / transport.medium.steps, transport.exchanges_per_hour
+            lines += together_lines({n: each(n, state) * dt for n in self.exchanges()})
         return lines
+
+    def check_step(self, dt: float, divides: bool) -> None:
+        super().check_step(dt, divides)
+        transport = self.plan.transport
+        check_schedules(
+            self.effect, dt / (transport.medium.steps if transport else self.plan.turns)
+        )
 
     @property
     def why_turns(self) -> str:

@@ -31,7 +31,6 @@ from torchfilm.effects.circuit_checks import (
     check_initial,
     check_method,
     check_rates,
-    check_schedules,
     check_species,
     diluted_names,
     equations_of,
@@ -350,9 +349,6 @@ class Circuit(Effect):
             ' Give one circuit a name, Circuit(…, name="second"), or share the species, Circuit(…,'
             f" shared=({name!r},))."
         )
-
-    def check_step(self, dt: float, divides: bool) -> None:
-        check_schedules(self, dt)
 
     def at_least_zero(self) -> tuple[str, ...]:
         return self.own_fields

@@ -136,13 +136,17 @@ class Growth(Effect):
         """Whether growth_rate is all that it goes by."""
         return not self.sets_rate and self.factor is None
 
+    def needs(self) -> tuple[str, ...]:
+        return (*self._paid(), *self._slowed())
+
     def reads(self) -> tuple[str, ...]:
         return (*(self._paid() or ("growth_rate",)), "length", "radius", *self._slowed())
 
     def waits_for(self) -> Mapping[str, str]:
         if self.species is not None:
             return {self.species: "a rate of it in a circuit"}
-        return {"growth_rate": "a parameter above 0 (such as rate=1.0)"}
+        slowed = dict.fromkeys(self._slowed(), "a factor above 0")
+        return {"growth_rate": "a parameter above 0 (such as rate=1.0)", **slowed}
 
     def writes(self) -> tuple[str, ...]:
         rate = ("growth_rate",) if self.sets_rate else ()
@@ -176,11 +180,6 @@ class Growth(Effect):
                     f"Growth.species = {name!r}: growth does not dilute this species, so that cells"
                     " would grow by more or less than was paid for. Leave out Circuit.dilution, or"
                     f" name {name!r} in it."
-                )
-            if "growth_rate" in other.writes():
-                raise checks.InputError(
-                    f"{other.title} sets growth_rate, and Growth.species = {name!r} sets it again"
-                    " in each step. Keep one of them."
                 )
 
     def check(self, state: State, values: Values) -> None:
@@ -248,7 +247,6 @@ class _BoundGrowth(BoundEffect):
 
     effect: Growth
     setters: tuple[str, ...] = ()  # effects that set growth_rate, whatever it was
-    changers: tuple[str, ...] = ()  # rules that change it by what it was
 
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         """Raise InputError where a rate by cell type would undo what another effect sets."""
@@ -257,19 +255,26 @@ class _BoundGrowth(BoundEffect):
             for e in effects
             if e is not self and "growth_rate" in e.writes() and "growth_rate" not in e.reads()
         )
-        self.changers = tuple(
-            e.title
-            for e in effects
-            if e.effect.writes_anything
-            and {"growth_rate"} <= {*e.writes()} & {*e.reads()}
-            and e.stage < GROWTH
-        )
-        for other in effects if self.effect.by_type else ():
-            if other is not self and "growth_rate" in other.writes():
+        growth = self.effect
+        for other in effects:
+            if other is self or "growth_rate" not in other.writes():
+                continue
+            if growth.by_type:
                 raise checks.InputError(
-                    f"{other.title} sets growth_rate, but Growth.rate = {self.effect.rate!r} sets"
-                    " it again by cell type in every step. Set cell_type instead, or give Growth"
-                    " one rate, or none."
+                    f"{other.title} sets growth_rate, but Growth.rate = {growth.rate!r} sets it"
+                    " again by cell type in every step. Set cell_type instead, or give Growth one"
+                    " rate, or none."
+                )
+            if growth.species is not None:
+                raise checks.InputError(
+                    f"{other.title} sets growth_rate, and Growth.species = {growth.species!r} sets"
+                    " it again in each step. Keep one of them."
+                )
+            if growth.factor is not None and not other.effect.writes_anything:
+                raise checks.InputError(
+                    f"{other.title} sets growth_rate by what cells have taken up, and Growth.factor"
+                    f" = {growth.factor!r} would let them grow by less. Give it the factor:"
+                    f" tf.{type(other.effect).__name__}(…, factor={growth.factor!r})."
                 )
 
     def check(self, state: State) -> None:
@@ -289,12 +294,6 @@ class _BoundGrowth(BoundEffect):
         """Warn where a growth rate has no effect since an effect sets another one."""
         rate = self.effect.rate
         given = [] if rate is None or not bool(numbers(rate).any()) else ["Growth.rate"]
-        if given and self.changers:
-            warn(
-                f"{' and '.join(self.changers)} read growth_rate and set it: what multiplies it"
-                " does so again in each step. What slows cells down is a factor of its own:"
-                " tf.Growth(rate=…, factor='vigour') and tf.Rules(…, variables={'vigour': 1.0})."
-            )
         sources = [*given, *self.setters]
         if len(sources) > 1:
             first = "Growth.rate is that of first cells only, and " if given else ""

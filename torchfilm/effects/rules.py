@@ -23,6 +23,7 @@ from torchfilm.effects.bound_division_rule import DivisionRule
 from torchfilm.effects.bound_rules import MEANING, BoundRules
 from torchfilm.resolver import Values
 from torchfilm.rule_views import OF_EFFECTS, CellsView, DivisionView
+from torchfilm.signals.schedule import Schedule
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import HotReload, edited, load_functions
@@ -110,6 +111,11 @@ class Rules(Effect):
                 "Rules.parameters are what rules read as cells.p, but the cells have a field 'p':"
                 " rename the field."
             )
+
+    def check_step(self, dt: float, divides: bool) -> None:
+        for name, value in self.parameters.items():
+            if isinstance(value, Schedule):
+                value.warn_of_step(f"Rules.{name}", dt)
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return tuple(Field(name, MEANING, initial=value) for name, value in self.variables.items())

@@ -40,9 +40,10 @@ def pixel_size_of(image: Any, given: float | None) -> float:
                 " pixels: resample the image."
             )
         return across
-    if abs(across / given - 1) > ALIKE:
+    if max(abs(across / given - 1), abs(down / given - 1)) > ALIKE:
+        size = f"{across:g}" if abs(across / down - 1) <= ALIKE else f"{across:g} × {down:g}"
         warn(
-            f"pixel_size = {given:g} µm, but {image} states {across:g} µm a pixel. Was the image"
+            f"pixel_size = {given:g} µm, but {image} states {size} µm a pixel. Was the image"
             " scaled after it was taken?"
         )
     return given
