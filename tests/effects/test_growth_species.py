@@ -129,6 +129,15 @@ def test_gradients_pass_through_growth():
     assert float(slope) > 0
 
 
+def test_a_step_of_no_time_spends_nothing():
+    cells = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], extra={"grown": [0.5]})
+    model = tf.Scene(tf.Growth(species="grown"), founders=cells).bind()
+    first = model.start()
+    still = model.step(first, 0.0)
+    assert torch.equal(still.grown, first.grown) and torch.equal(still.length, first.length)
+    assert float(model.step(first).volume / first.volume) == pytest.approx(1.5)
+
+
 PACE = lambda u, s, p, cell: {"grown": 1.0}
 
 

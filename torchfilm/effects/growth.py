@@ -217,7 +217,7 @@ class Growth(Effect):
     def step(self, state: State, dt: float, values: Values) -> State:
         if self.by_type:
             state = state.with_fields(growth_rate=values.rate.of_cells(state))
-        if self.species is not None:
+        if self.species is not None and dt > 0:  # a step of no time spends nothing
             paid = state.fields[self.species]
             state = state.with_fields(
                 growth_rate=(torch.log1p(paid) / dt).to(state.growth_rate.dtype),
