@@ -344,9 +344,10 @@ def _per_colony(name: str, value: Any, batch: BoundBatch, listed: bool = True) -
             pairs = ", ".join(
                 f"{k}: {float(v):g}" for k, v in zip(batch.types, given.detach(), strict=True)
             )
+            short = name.partition(",")[0].split(".")[-1]  # without the time in a schedule
             raise checks.InputError(
                 f"{name} has {given.numel()} values, and the batch has {batch.colonies} colonies"
-                f" and as many cell types. Write {name.split('.')[-1]}={{{pairs}}} for one value"
+                f" and as many cell types. Write {short}={{{pairs}}} for one value"
                 " per cell type, or tf.PerColony([…]) for one per colony."
             )
     return given.to(dtype=batch.dtype, device=batch.device, copy=True)
