@@ -308,7 +308,7 @@ class CellView:
         found = getattr(self._cells, name)
         if isinstance(found, Names):
             one = [found[n][self._index] for n in found]
-            return Names(tuple(found), one, f"cell.{name}", found.why)
+            return Names(tuple(found), one, f"cell.{name}", found._why)
         if name in ONE_BY_ONE:
             drawn = self._cells._draws_of.setdefault(self._index, OneCell(self._cells, self._index))
             return lambda *given: getattr(drawn, name)(*given)[0]

@@ -83,9 +83,10 @@ class Scene(metaclass=checks.KnownKeywords):
             "draw": None,
         }
         if founders is not None and not isinstance(founders, Cells):
-            if not callable(founders):
+            if not callable(founders) or isinstance(founders, type):
                 rule = "Cells, or a function from a seed to Cells"
-                raise checks.input_error("Scene.founders", founders, rule)
+                hint = "Such as tf.Cells.single(2), or tf.inoculum(…) for several."
+                raise checks.input_error("Scene.founders", founders, rule, hint)
             made["draw"], founders = founders, one_draw(founders, 0)
         made["dim"] = _dimension(effects, founders, dim)
         made["founders"] = founders if founders is not None else Cells.single(made["dim"])

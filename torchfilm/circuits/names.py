@@ -56,11 +56,6 @@ class Names:
     def __delattr__(self, name: str) -> None:
         raise UnknownName(f"{self._label}.{name} can only be read.")
 
-    @property
-    def why(self) -> str:
-        """Why nothing may be written to it."""
-        return self._why
-
     def __contains__(self, name: str) -> bool:
         return name in self.__dict__
 
