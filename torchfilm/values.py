@@ -85,6 +85,10 @@ class Rule:
     scheduled: bool = False
 
 
+# of the constants that a user's own functions read, in circuits and rules
+CONSTANT = Rule(scheduled=True)
+
+
 def physical(default: Any = dataclasses.MISSING, **rule: Any) -> Any:
     """A field of an effect that holds a physical value: `rate: Value = physical(1.0, unit="1/h",
     least=0.0)`."""

@@ -25,12 +25,13 @@ from torchfilm.circuits.tracing import Untraceable
 from torchfilm.circuits.trial import try_circuit
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.circuit_cells import Kind, cell_column, cell_names, cells_of_type
-from torchfilm.effects.circuit_checks import check_read, check_schedules, schedules_of
+from torchfilm.effects.circuit_checks import check_read
 from torchfilm.effects.circuit_kernels import CircuitKernels, PreparedStep, Taken
 from torchfilm.effects.circuit_report import Failures
 from torchfilm.effects.circuit_words import methods_of, together_lines
 from torchfilm.medium_exchange import Around, Exchanged, MediumExchange, Ramped, form_of
 from torchfilm.resolver import Values, snapshot
+from torchfilm.signals.schedule import Schedule, warn_of_steps
 from torchfilm.state import OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import why_torch
@@ -230,18 +231,18 @@ class BoundCircuit(BoundEffect):
         transport = self.plan.transport  # where it is solved together with circuits
         exchanged = () if transport else self.exchanges()
         lines = methods_of(self.effect, dt, self.plan.turns, self._why_torch(), exchanged)
-        lines += [f"{n} {x.told}" for n, x in schedules_of(self.effect).items()]
+        each = self.effect.parameters.items()
+        lines += [f"{n} {x.told}" for n, x in each if isinstance(x, Schedule)]
         if transport:
-            dt, each = dt / transport.medium.steps, transport.exchanges_per_hour
-            lines += together_lines({n: each(n, state) * dt for n in self.exchanges()})
+            pace, dt = transport.exchanges_per_hour, dt / transport.medium.steps
+            lines += together_lines({n: pace(n, state) * dt for n in self.exchanges()})
         return lines
 
     def check_step(self, dt: float, divides: bool) -> None:
         super().check_step(dt, divides)
-        transport = self.plan.transport
-        check_schedules(
-            self.effect, dt / (transport.medium.steps if transport else self.plan.turns)
-        )
+        together, circuit = self.plan.transport, self.effect
+        dt /= together.medium.steps if together else self.plan.turns
+        warn_of_steps(circuit.value_owner(), circuit.parameters, dt, late=0.5)
 
     @property
     def why_turns(self) -> str:
@@ -333,10 +334,8 @@ class BoundCircuit(BoundEffect):
         half = half_way(length, state.radius, volume)
         each, dtype = ((n, state.fields[n]) for n in self.fields), state.dtype
         fields = {n: x if x.dtype == dtype else x.to(dtype) for n, x in each}
-        return (
-            state.with_length(half.length, half.volume, half.area),
-            Start(fields, circuit.diluted_fields, half),
-        )
+        middle = state.with_length(half.length, half.volume, half.area)
+        return middle, Start(fields, circuit.diluted_fields, half)
 
     def _by_torch(
         self,

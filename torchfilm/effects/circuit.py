@@ -45,12 +45,12 @@ from torchfilm.resolver import Values
 from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.backends import check_backend
-from torchfilm.values import COLONY, CONCENTRATION, Rule, Value, checked
+from torchfilm.values import COLONY, CONCENTRATION, CONSTANT, Rule, Value, checked
 
 Part = run.RateFunction | Sequence[Reaction | Sequence[Reaction]]
 
 EVERY = "every cell"  # where a circuit runs that is not given by type
-CONSTANT, POSITIVE = Rule(scheduled=True), Rule(least=0.0, scheduled=True)
+POSITIVE = dataclasses.replace(CONSTANT, least=0.0)
 EACH_CELL = "initial[{!r}]"  # by which name the first value of a species is resolved
 
 

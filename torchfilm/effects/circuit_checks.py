@@ -192,14 +192,3 @@ def check_read(circuit: Any, read: set[str]) -> None:
         like = difflib.get_close_matches(name, known, 1)
         hint = f". Did you mean {like[0]!r}?" if like else f": remove it, or use it as p.{name}."
         warn(f"Circuit.{name} is a constant that no rate reads{hint}")
-
-
-def schedules_of(circuit: Any) -> dict[str, Schedule]:
-    """Its constants that change in time."""
-    return {n: x for n, x in circuit.parameters.items() if isinstance(x, Schedule)}
-
-
-def check_schedules(circuit: Any, dt: float) -> None:
-    """Warn where steps of dt hours do not follow them."""
-    for name, schedule in schedules_of(circuit).items():
-        schedule.warn_of_step(f"{circuit.value_owner()}.{name}", dt, late=0.5)

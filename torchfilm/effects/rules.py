@@ -23,13 +23,11 @@ from torchfilm.effects.bound_division_rule import DivisionRule
 from torchfilm.effects.bound_rules import MEANING, BoundRules
 from torchfilm.resolver import Values
 from torchfilm.rule_views import OF_EFFECTS, CellsView, DivisionView
-from torchfilm.signals.schedule import Schedule
+from torchfilm.signals.schedule import warn_of_steps
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import HotReload, edited, load_functions
-from torchfilm.values import Rule, Value, checked
-
-CONSTANT = Rule(scheduled=True)
+from torchfilm.values import CONSTANT, Rule, Value, checked
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +111,7 @@ class Rules(Effect):
             )
 
     def check_step(self, dt: float, divides: bool) -> None:
-        for name, value in self.parameters.items():
-            if isinstance(value, Schedule):
-                value.warn_of_step(f"Rules.{name}", dt)
+        warn_of_steps("Rules", self.parameters, dt)
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return tuple(Field(name, MEANING, initial=value) for name, value in self.variables.items())

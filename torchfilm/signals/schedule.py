@@ -123,6 +123,13 @@ class Schedule(metaclass=checks.KnownKeywords):
         return f"changes at {times} h{again}" if times else "stays as it is"
 
 
+def warn_of_steps(owner: str, values: Mapping[str, Any], dt: float, late: float = 0.0) -> None:
+    """Warn as `Schedule.warn_of_step` of those values of an effect, by name, that are schedules."""
+    for name, value in values.items():
+        if isinstance(value, Schedule):
+            value.warn_of_step(f"{owner}.{name}", dt, late)
+
+
 def each_value(given: Any) -> tuple[Any, ...]:
     """All values that a value of a medium takes."""
     return tuple(given.values.values()) if isinstance(given, Schedule) else (given,)
