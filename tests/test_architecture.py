@@ -285,6 +285,12 @@ def test_text_is_utf8_in_every_locale():
     assert found == []
 
 
+def test_no_two_test_files_have_one_name():
+    """pytest imports a test file by its name alone, and refuses the second of a name."""
+    names = [path.name for path in sorted((ROOT / "tests").rglob("*.py"))]
+    assert [n for n in set(names) - {"conftest.py"} if names.count(n) > 1] == []
+
+
 def test_public_names_exist():
     assert [name for name in torchfilm.__all__ if not hasattr(torchfilm, name)] == []
     assert len(set(torchfilm.__all__)) == len(torchfilm.__all__)
