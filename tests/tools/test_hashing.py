@@ -36,6 +36,21 @@ class Adding:
         return x + self.size
 
 
+class Slotted:
+    __slots__ = ("__hidden", "size")
+
+    def __init__(self, size, hidden):
+        self.size, self.__hidden = size, hidden
+
+
+def using(size):
+    """A function that relies on an object of its own module."""
+    code = "class Nutrients:\n  def __init__(self, size): self.size = size\n"
+    names: dict = {"__name__": "of_a_user"}
+    exec(f"{code}nutrients = Nutrients({size})\ndef f(x): return x + nutrients.size", names)
+    return names["f"]
+
+
 @pytest.mark.parametrize(
     "one, other",
     [
@@ -61,6 +76,9 @@ class Adding:
         (holding(1), holding(2)),
         (Thing(1.0), Thing(2.0)),
         (Adding(1.0).to, Adding(2.0).to),
+        (Slotted(1.0, 0), Slotted(2.0, 0)),
+        (Slotted(1.0, 0), Slotted(1.0, 1)),
+        (using(1.0), using(2.0)),
         (
             partial(made("def f(x, k): return x + k"), k=1),
             partial(made("def f(x, k): return x - k"), k=1),
@@ -87,6 +105,8 @@ def test_what_differs_is_distinguished(one, other):
         ),
         (made("size = 3\ndef f(x): return x.size"), made("size = 4\ndef f(x): return x.size")),
         (Adding(1.0).to, Adding(1.0).to),
+        (Slotted(1.0, 0), Slotted(1.0, 0)),
+        (using(1.0), using(1.0)),
         (partial(holding, 1), partial(holding, 1)),
     ],
 )

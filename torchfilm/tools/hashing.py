@@ -93,7 +93,7 @@ def _parts(thing: Any) -> list[Any]:
         return sorted(map(repr, thing))
     if (
         isinstance(thing, type)
-        or not hasattr(thing, "__dict__")
+        or not (hasattr(thing, "__dict__") or _slots(thing))
         or type(thing).__module__ == "builtins"
     ):
         return [without_addresses(repr(thing))]
@@ -104,7 +104,8 @@ def _parts(thing: Any) -> list[Any]:
     elif kind.__module__.split(".")[0] in OURS:
         return [kind.__qualname__, without_addresses(repr(thing))]
     else:
-        given = [x for name, value in vars(thing).items() for x in (name, value)]
+        held = getattr(thing, "__dict__", {}) | _slots(thing)
+        given = [x for name, value in held.items() for x in (name, value)]
     # a user's class also counts by its functions
     own = [c for c in kind.__mro__ if c.__module__.split(".")[0] not in OURS]
     return [
@@ -114,9 +115,23 @@ def _parts(thing: Any) -> list[Any]:
     ]
 
 
+def _slots(thing: Any) -> dict[str, Any]:
+    """The attributes that an object of a user's class keeps in `__slots__`."""
+    names: list[str] = []
+    for kind in type(thing).__mro__:
+        if kind.__module__.split(".")[0] not in OURS:
+            slots = vars(kind).get("__slots__", ())
+            own = (slots,) if isinstance(slots, str) else slots
+            # Python keeps a name that begins with two underscores under another one
+            private = f"_{kind.__name__.lstrip('_')}"
+            names += [private + n if re.fullmatch(r"__\w*(?<!__)", n) else n for n in own]
+    names = [n for n in names if n not in ("__dict__", "__weakref__")]
+    return {n: getattr(thing, n) for n in names if hasattr(thing, n)}
+
+
 def _globals(function: FunctionType) -> list[Any]:
-    """The numbers, texts, arrays, dataclasses and functions of its own module that a function
-    uses."""
+    """The numbers, texts, arrays, dataclasses, and the functions and objects of its own module
+    that a function uses."""
     names: list[str] = []
     codes = [function.__code__]
     while codes:
@@ -133,6 +148,7 @@ def _globals(function: FunctionType) -> list[Any]:
         if isinstance(x, plain)
         or (dataclasses.is_dataclass(x) and not isinstance(x, type))
         or (isinstance(x, FunctionType) and x.__module__ == function.__module__)
+        or type(x).__module__ == function.__module__
     ]
 
 
