@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchfilm.circuits.draws import poisson
 from torchfilm.circuits.partition import binomial
 from torchfilm.rule_values import RuleError, as_tensor
 from torchfilm.state import State
@@ -26,19 +27,44 @@ class Draws:
     def random(self) -> Tensor:
         """A draw from (0, 1) for each cell, (N,), or each division, (M,), keyed by seed, colony,
         cell and step. It does not depend on the batch."""
+        return self._state.uniform(*self._next())
+
+    def normal(self) -> Tensor:
+        """A standard normal draw for each cell, (N,), or each division, (M,), of mean 0 and
+        standard deviation 1. A rate that daughters inherit with a change of about a tenth, say:
+        daughter1.rate = parent.rate * torch.exp(0.1 * daughter1.normal())."""
+        return self._state.normal(*self._next())[:, 0]
+
+    def _next(self) -> tuple[Tensor, str]:
+        """The rows that draw, and the purpose of the next draw."""
         self.__dict__["_draws"] += 1
         every = torch.arange(self._state.cells, device=self._state.device)
-        return self._state.uniform(
-            every if self._rows is None else self._rows, f"{self._purpose} {self._draws}"
-        )
+        return every if self._rows is None else self._rows, f"{self._purpose} {self._draws}"
 
     def chance(self, probability: float | Tensor) -> Tensor:
         """Whether something of this probability happens to each cell, (N,), or at each division,
         (M,), bool. For a rate, 1/h, give 1 − exp(−rate · cells.dt)."""
-        drawn = self.random()
-        # two draws of 23 bits, or the rarest events would never happen
-        fine = ((drawn.double() * BITS).floor() + self.random().double()) / BITS
+        fine = self._fine()
         return fine < _probability("chance", probability, fine)
+
+    def poisson(self, mean: float | Tensor) -> Tensor:
+        """How many independent events happen of which this `mean` is expected: one draw for each
+        cell, (N,), or each division, (M,). New mutations, say, at a rate of 0.003 per hour:
+        cells.mutations = cells.mutations + cells.poisson(0.003 * cells.dt)."""
+        fine = self._fine()
+        expected = _column("poisson", mean, fine)
+        wrong = ~((expected >= 0) & expected.isfinite())
+        if bool(wrong.any()):
+            raise RuleError(
+                f"poisson was given the mean {expected[wrong][0]:g}: it must be 0 or more"
+            )
+        return poisson(expected, fine).to(self._state.dtype)
+
+    def _fine(self) -> Tensor:
+        """A draw from (0, 1) in float64: two draws of 23 bits, or the rarest events would never
+        happen."""
+        drawn = self.random()
+        return ((drawn.double() * BITS).floor() + self.random().double()) / BITS
 
     def binomial(self, number: float | Tensor, probability: float | Tensor) -> Tensor:
         """How many of a `number` come out right, each with this probability: one draw for each

@@ -41,7 +41,7 @@ IDENTITY = ("uid", "parent", "colony")
 # fields that only an effect acts on
 OF_EFFECTS = {"growth_rate": "tf.Growth()", "divide_flag": "tf.Division()"}
 SECRETES = "a circuit says what cells give to a signal and take from it"
-ONE_BY_ONE = ("random", "chance", "binomial")
+ONE_BY_ONE = ("random", "normal", "chance", "binomial", "poisson")
 # How a view finds the constants that rules were given, its `p`; None: they were given none.
 Constants = Callable[[], Names] | None
 KNOWN_FIELDS = {

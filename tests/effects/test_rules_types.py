@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -143,6 +145,56 @@ def test_chance_and_binomial_follow_their_laws():
     assert torch.equal(count, count.round()) and float(count.max()) <= 20
 
 
+def test_normal_and_poisson_follow_their_laws():
+    seen = {}
+
+    def draw(cells):
+        seen["normal"], seen["few"] = cells.normal(), cells.poisson(0.2)
+        seen["many"], seen["again"] = cells.poisson(torch.full((4000,), 90.0)), cells.normal()
+        cells.mark = seen["few"]
+
+    many = tf.Cells([[9.0 * k, 0.0] for k in range(4000)], [[0.0, 1.0]] * 4000)
+    model = tf.Scene(tf.Rules(draw, variables={"mark": 0.0}), dim=2, founders=many).bind()
+    model.step(model.start(), 0.1)
+    expected = {  # mean, variance, fourth central moment
+        "normal": (0.0, 1.0, 3.0),
+        "again": (0.0, 1.0, 3.0),
+        "few": (0.2, 0.2, 0.2 + 3 * 0.04),
+        "many": (90.0, 90.0, 90.0 + 3 * 8100.0),
+    }
+    for name, (mean, variance, fourth) in expected.items():
+        x = seen[name].double()
+        assert x.shape == (4000,)
+        # five standard errors, of the mean and of the variance
+        assert float(x.mean()) == pytest.approx(mean, abs=5 * (variance / 4000) ** 0.5)
+        error = ((fourth - variance**2) / 4000) ** 0.5
+        assert float(x.var()) == pytest.approx(variance, abs=5 * error)
+    both = torch.stack([seen["normal"], seen["again"]]).double()
+    assert abs(float(torch.corrcoef(both)[0, 1])) < 5 / 4000**0.5
+    assert torch.equal(seen["many"], seen["many"].round())
+
+
+def test_an_inherited_trait_spreads_as_a_random_walk():
+    def inherit(parent, daughter1, daughter2):
+        for daughter in (daughter1, daughter2):
+            daughter.trait = parent.trait + 0.1 * daughter.normal()
+
+    scene = tf.Scene(
+        tf.Rules(None, inherit, variables={"trait": 0.0}),
+        tf.Growth(rate=math.log(2.0)), tf.Division(length=4.0), dim=2,
+    )  # fmt: skip
+    *_, last = tf.simulate(scene, colonies=40, until=6.0, dt=0.1, seed=3)
+    *_, alone = tf.simulate(scene, streams=[7], until=6.0, dt=0.1, seed=3)
+    assert torch.equal(last.trait[last.colony == 7], alone.trait)
+    generations = round(math.log2(last.cells / 40))
+    assert last.cells == 40 * 2**generations and generations >= 5
+    # cells of one colony share ancestors: the variance is over one cell of each, by the χ² law
+    one = torch.stack([last.trait[last.colony == c][0] for c in range(40)]).double()
+    ratio = float(one.square().mean()) / (generations * 0.01)
+    assert abs(ratio - 1) < 5 * (2 / 40) ** 0.5
+    assert len(last.trait.unique()) == last.cells
+
+
 def test_plasmids_go_to_one_daughter_or_the_other():
     def part(parent, daughter1, daughter2):
         k = parent.binomial(parent.plasmids, 0.5)
@@ -164,6 +216,8 @@ def test_plasmids_go_to_one_daughter_or_the_other():
     [
         (lambda c: c.chance(1.5), "the probability 1.5: it must be between 0 and 1"),
         (lambda c: c.chance(float("nan")), "the probability nan"),
+        (lambda c: c.poisson(-1.0), "poisson was given the mean -1: it must be 0 or more"),
+        (lambda c: c.poisson(float("inf")), "poisson was given the mean inf"),
         (lambda c: c.binomial(2.5, 0.5), "the number 2.5: it must be whole, 0 or more"),
         (lambda c: c.binomial(3, torch.ones(7)), r"shape \(7,\): it must be one value, or \(1,\)"),
         (lambda c: c.contacts(-1.0), r"contacts\(within\) = -1.0 is not allowed"),

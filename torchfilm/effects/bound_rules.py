@@ -350,8 +350,8 @@ def own_draws(label: str) -> Iterator[None]:
     if states() != before:
         warn(
             f"{label} draws random numbers with torch, numpy or random: another run with the same"
-            " seed has other numbers. Use cells.random(), cells.chance(p) or"
-            " cells.binomial(n, p), which are keyed by seed, colony, cell and step."
+            " seed has other numbers. Use cells.random(), normal(), chance(p), binomial(n, p)"
+            " or poisson(mean), which are keyed by seed, colony, cell and step."
         )
 
 
