@@ -5,8 +5,9 @@
 
 Each example draws a scene and runs it for a few steps under the laws of `run`. It draws sizes,
 crowding, walls, α or stiffness, γ, growth, division, circuits with Hill terms and stiff decay,
-signals on grids of odd shapes with boundary conditions, flow and obstacles, and steps from less
-than a second to hours. With --contacts it draws cells, one-sided contacts, walls and growth alone.
+signals on grids of odd shapes with boundary conditions, flow and obstacles, cells that burst, and
+steps from less than a second to hours. With --contacts it draws cells, one-sided contacts, walls
+and growth alone.
 The last step of one-sided contacts is computed by the compiled kernels and by the torch reference.
 Hypothesis reduces the first example that breaks a law and prints it as a `Draw`, which `run`
 accepts. fuzz_log.md lists the findings. tests/test_fuzz.py runs a hundred examples.

@@ -114,12 +114,14 @@ class Beside:
     """Other effects.
 
     eating: cells grow on the signal, if there is one and growth is by volume. rule: action of a
-    user rule. leaving: remove cells outside the cube in which they start.
+    user rule. leaving: remove cells outside the cube in which they start. bursting: cells burst at
+    random, and what a circuit makes in them goes to the signal, if there are both.
     """
 
     eating: bool
     rule: str | None
     leaving: bool
+    bursting: bool = False
 
 
 @dataclass(frozen=True)
@@ -251,6 +253,7 @@ BESIDE = st.builds(
     eating=st.booleans(),
     rule=st.sampled_from([None, "grow", "divide", "remove", "read"]),
     leaving=st.sampled_from([False, False, True]),
+    bursting=st.sampled_from([False, False, True]),
 )
 NO_OTHERS = Beside(eating=False, rule=None, leaving=False)
 TIMES = {

@@ -234,6 +234,9 @@ def scene_of(draw: Draw) -> tuple[tf.Scene, tf.State]:
     effects += [] if draw.outside is None else [medium(draw.outside, draw.capsules.dim)]
     effects += [] if draw.inside is None else [circuit(draw.inside, draw.outside)]
     effects += rules(draw)
+    if draw.beside.bursting:
+        both = draw.inside is not None and draw.outside is not None
+        effects.append(tf.Lysis(rate=2.0, releases={"ahl": ("a", "b")} if both else None))
     if draw.beside.leaving:
         side = draw.capsules.within
         effects.append(tf.Removal((-side,) * draw.capsules.dim, (side,) * draw.capsules.dim))

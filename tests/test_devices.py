@@ -18,6 +18,7 @@ STEPS = {
     "programmed_growth": 20,
     "quorum_sensing": 8,
     "boundary_detector": 8,
+    "synchronized_lysis": 8,
     "random_partition": 8,
     "nutrient_limited": 8,
 }

@@ -23,6 +23,7 @@ SMALL = {
     "quorum_sensing": {"k3": [0.5, 2.0], "size": 64.0},
     "boundary_detector": {"d3": [0.0, 1e-3]},
     "boundary_detector under flow": {"flow": 5.0},
+    "synchronized_lysis": {"threshold": [2.0, 4.0], "half": 0.01, "lysis_rate": 1.0},
     "random_partition": {},
     "repressilator": {"alpha": [216.0, 100.0], "noise": False, "rate": 1.0},
     "toggle_switch": {"strength": [10.0, 12.0], "speed": 2, "molecules_per_unit": 2.0, "rate": 1.0},

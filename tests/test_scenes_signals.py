@@ -266,6 +266,7 @@ def test_what_is_eaten_times_the_yield_is_what_is_grown():
     [
         "quorum_sensing",
         "boundary_detector",
+        "synchronized_lysis",
         "random_partition",
         "repressilator",
         "toggle_switch",

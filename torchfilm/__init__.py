@@ -11,6 +11,7 @@ from torchfilm.effect import Effect
 from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
+from torchfilm.effects.lysis import Lysis
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.medium import Medium
 from torchfilm.effects.nutrition import Monod
@@ -86,6 +87,7 @@ __all__ = [
     "InputError",
     "LivePlot",
     "LogNormal",
+    "Lysis",
     "Mechanics",
     "Medium",
     "Model",

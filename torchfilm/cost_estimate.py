@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from scipy.optimize import nnls
 
-from torchfilm.effect import REMOVAL
+from torchfilm.effect import LYSIS, REMOVAL
 from torchfilm.initial_cells import Cells
 from torchfilm.loop import advance, failures
 from torchfilm.model import Model
@@ -289,7 +289,7 @@ def _run(
         for k in range(steps)
         for abc in spent.values()
     )
-    leave = any(effect.stage == REMOVAL for effect in scene.effects)
+    leave = any(effect.stage in (LYSIS, REMOVAL) for effect in scene.effects)
     return (
         f"{steps} steps ({steps * scene.dt:.3g} h), {_time(taken)}, from the founders at the"
         " probe's growth rate; more if pressure or lack of nutrient slows growth"

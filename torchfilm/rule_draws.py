@@ -12,8 +12,7 @@ from torchfilm.circuits.draws import poisson
 from torchfilm.circuits.partition import binomial
 from torchfilm.rule_values import RuleError, as_tensor
 from torchfilm.state import State
-
-BITS = 2.0**23  # of a uniform draw
+from torchfilm.tools.random import fine_uniform
 
 
 class Draws:
@@ -61,10 +60,7 @@ class Draws:
         return poisson(expected, fine).to(self._state.dtype)
 
     def _fine(self) -> Tensor:
-        """A draw from (0, 1) in float64: two draws of 23 bits, or the rarest events would never
-        happen."""
-        drawn = self.random()
-        return ((drawn.double() * BITS).floor() + self.random().double()) / BITS
+        return fine_uniform(self.random(), self.random())
 
     def binomial(self, number: float | Tensor, probability: float | Tensor) -> Tensor:
         """How many of a `number` come out right, each with this probability: one draw for each

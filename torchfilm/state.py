@@ -18,7 +18,7 @@ from torchfilm.tools.ragged import Groups, offsets
 from torchfilm.tools.read_only import read_only
 
 CELL, COLONY, GRID = "cell", "colony", "grid"
-FATES = ("divided", "removed", "left", "failed")  # why cells leave a state
+FATES = ("divided", "removed", "left", "failed", "lysed")  # why cells leave a state
 # Signals stand among the fields under "out.NAME", beside what cells hold under the same name.
 OUTSIDE = "out."
 
@@ -86,7 +86,7 @@ class Births:
 @dataclass(frozen=True)
 class Ended:
     """Cells that left in one step: colony ids and uids (M,) int64, and why ("divided", "removed",
-    "left", "failed")."""
+    "left", "failed", "lysed")."""
 
     colony_id: Tensor
     uid: Tensor

@@ -264,13 +264,14 @@ def test_colonies_without_first_cells_are_warned_of():
 
 def test_rare_events_happen():
     """One in ten million cells: a uniform draw of 23 bits alone is never below 6e-8."""
-    from torchfilm.rule_draws import BITS, Draws
+    from torchfilm.rule_draws import Draws
+    from torchfilm.tools.random import BITS
 
     class Least(Draws):
         """The first draw is the least one, the second one in the middle."""
 
         def __init__(self, second):
-            self.given = iter([torch.tensor([0.5 / BITS]), torch.tensor([second])])
+            self.given = iter([torch.tensor([0.5 * 2.0**-BITS]), torch.tensor([second])])
 
         def random(self):
             return next(self.given)

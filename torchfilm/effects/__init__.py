@@ -4,6 +4,7 @@ only."""
 from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
+from torchfilm.effects.lysis import Lysis
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.medium import Medium
 from torchfilm.effects.nutrition import Monod
@@ -18,6 +19,7 @@ KNOWN = {
     "mechanics": Mechanics,
     "circuit": Circuit,
     "transport": Medium,
+    "lysis": Lysis,
     "division": Division,
     "removal": Removal,
 }

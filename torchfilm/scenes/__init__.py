@@ -63,6 +63,7 @@ programmed_growth = _ready(colonies.programmed_growth)
 channel = _ready(channels.channel)
 quorum_sensing = _ready(signalling.quorum_sensing)
 boundary_detector = _ready(signalling.boundary_detector)
+synchronized_lysis = _ready(signalling.synchronized_lysis)
 random_partition = _ready(circuits.random_partition)
 repressilator = _ready(circuits.repressilator)
 toggle_switch = _ready(circuits.toggle_switch)
@@ -76,6 +77,7 @@ READY: dict[str, Callable[..., Scene]] = {
         channel,
         quorum_sensing,
         boundary_detector,
+        synchronized_lysis,
         random_partition,
         repressilator,
         toggle_switch,

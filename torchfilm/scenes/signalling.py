@@ -1,6 +1,6 @@
-"""Signalling through the medium: Lux quorum sensing and detection of a boundary.
+"""Signalling through the medium: Lux quorum sensing, detection of a boundary, lysis in step.
 
-They follow the paper's Table 2 and Fig. 5.
+The first two follow the paper's Table 2 and Fig. 5.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from torchfilm.distributions import Uniform
 from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
+from torchfilm.effects.lysis import Lysis
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.medium import Medium
 from torchfilm.effects.signal import Signal
@@ -139,4 +140,64 @@ def boundary_detector(
             flow=None if isinstance(flow, (int, float)) and flow == 0 else (flow, 0.0, 0.0),
         ),
         founders=Cells([[-1.5, 0.0], [1.5, 0.0]], [[1.0, 0.0], [1.0, 0.0]], cell_type=[0, 1]),
+    )
+
+
+def _lytic(u: Names, s: Names, p: Names, cell: Names):
+    on = s.ahl**2 / (p.half**2 + s.ahl**2)
+    made = {
+        "lysis_protein": p.strength * on - p.loss * u.lysis_protein,
+        "cargo": p.cargo + 0.0 * u.cargo,
+    }
+    return made, {"ahl": p.make * (p.leak + on) * cell.volume}
+
+
+def synchronized_lysis(
+    half: Value = 0.1,
+    make: Value = 100.0,
+    leak: Value = 0.05,
+    strength: Value = 20.0,
+    loss: Value = 2.0,
+    cargo: Value = 1.0,
+    threshold: Value = 4.0,
+    lysis_rate: Value = 3.0,
+    decay: Value = 8.0,
+    diffusion: Value = 1e6,
+    rate: float = 1.2,
+    size: float = 120.0,
+    spacing: float = 20.0,
+    length_drag: float = 1e5,
+) -> Scene:
+    """A population that grows, bursts together, releases its cargo, and grows again.
+
+    The plan is that of Din et al. 2016 (Nature 536, 81); equations and constants are chosen here,
+    for colonies of some hundred cells. AHL activates both its own synthesis and a lysis protein
+    beyond `half`; make: of AHL, conc/h, `leak` of it without AHL. strength, loss: of the lysis
+    protein, conc/h and 1/h. Above `threshold` cells burst, `lysis_rate` per hour, and release their
+    cargo (made at `cargo` conc/h). What flow would carry away decays, `decay` per hour, in a box
+    `size` µm wide and 1 µm deep, with no-flux faces. Growth is free.
+    """
+    corner = size / 2
+    return Scene(
+        Growth(rate=rate),
+        Division(length=Uniform(3.5, 4.5)),
+        Mechanics(dim=2, length_drag=length_drag),
+        Circuit(
+            _lytic,
+            species=("lysis_protein", "cargo"),
+            half=half,
+            make=make,
+            leak=leak,
+            strength=strength,
+            loss=loss,
+            cargo=cargo,
+        ),
+        Lysis("lysis_protein", above=threshold, rate=lysis_rate, releases={"cargo": "cargo"}),
+        Medium(
+            ahl=Signal(diffusion=diffusion, decay=decay),
+            cargo=Signal(diffusion=diffusion, decay=decay),
+            box=((-corner, -corner), (corner, corner)),
+            spacing=spacing,
+            depth=1.0,
+        ),
     )

@@ -19,6 +19,7 @@ from torchfilm.tools.numba_calls import as_array, kernels_loaded
 from torchfilm.tools.vectors import nearest_root
 
 MASK = 0xFFFFFFFF
+BITS = 23  # of a uniform draw: with half a unit, the most for which a float32 does not round to 1
 MULTIPLIER = (0xD2511F53, 0xCD9E8D57)
 WEYL = (0x9E3779B9, 0xBB67AE85)
 
@@ -85,8 +86,13 @@ def uniform(
 
         return torch.from_numpy(uniforms(*_arrays(seed, stream, uid, step, purpose))).to(dtype)
     w = words(seed, stream, uid, step, purpose)
-    # 23 bits and half a unit: the most bits for which a float32 does not round a draw to 1
-    return ((w[0] >> 9).to(torch.float64) + 0.5).mul(2.0**-23).to(dtype)
+    return ((w[0] >> 32 - BITS).to(torch.float64) + 0.5).mul(2.0**-BITS).to(dtype)
+
+
+def fine_uniform(coarse: Tensor, fine: Tensor) -> Tensor:
+    """A draw from (0, 1) of 46 bits, float64, from two of `uniform`: with 23 alone the rarest
+    events would never happen."""
+    return ((coarse.double() * 2.0**BITS).floor() + fine.double()) * 2.0**-BITS
 
 
 def normal(

@@ -1,0 +1,272 @@
+"""Lysis: cells burst, the medium gets all that they release, and the lineage remembers them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from exchanging_cells import totals
+from helpers import step
+
+import torchfilm as tf
+
+F32 = torch.float32
+BOX = [[-20.0, -20.0], [20.0, 20.0]]
+FOUR = tf.Cells([[6.0 * k - 9.0, 0.0] for k in range(4)], [[0.0, 1.0]] * 4, length=2.0)
+
+
+def stays(u, s, p, cell):
+    return {"toxin": 0.0 * u.toxin}
+
+
+def makes(u, s, p, cell):
+    return {"toxin": p.k + 0.0 * u.toxin}
+
+
+def leaks(u, s, p, cell):
+    out = 2.0 * u.toxin
+    return {"toxin": -out}, {"toxin": out * cell.volume}
+
+
+def holding(rates=stays, amount=5.0, **given) -> tf.Circuit:
+    return tf.Circuit(rates, species="toxin", initial={"toxin": amount}, **given)
+
+
+def medium(*signals: str, **given) -> tf.Medium:
+    named = {n: tf.Signal(diffusion=50.0) for n in signals}
+    return tf.Medium(**named, **({"box": BOX, "spacing": 2.0, "depth": 1.0} | given))
+
+
+def lost(state: tf.State) -> list[int]:
+    """The cells that burst in the last step."""
+    return [k for note in state.ended if note.fate == "lysed" for k in note.uid.tolist()]
+
+
+# --- which cells burst -------------------------------------------------------------------
+
+
+def test_cells_burst_in_the_step_in_which_they_exceed_the_bound(device, dtype):
+    scene = tf.Scene(
+        holding(makes, 0.0, k=1.0, dilution=False),
+        tf.Lysis(when="toxin", above={0: 0.35, 1: 9.0}),
+        founders=tf.Cells(FOUR.position, FOUR.axis, cell_type=[0, 1, 0, 1]), dt=0.1,
+    )  # fmt: skip
+    state = scene.bind(2, device=device, dtype=dtype).start()
+    for number in range(1, 6):
+        state = step(scene, state, 0.1)
+        assert state.counts.tolist() == ([4, 4] if number < 4 else [2, 2])
+        assert lost(state) == ([0, 2, 0, 2] if number == 4 else [])
+    assert state.cell_type.tolist() == [1, 1, 1, 1]
+
+
+def test_a_rule_chooses_cells_too():
+    def choose(cells):
+        cells.lysing = ((cells.uid == 2) & (cells.time > 0.15)).float()
+
+    scene = tf.Scene(
+        tf.Rules(choose, variables={"lysing": 0.0}), tf.Lysis(when="lysing"), founders=FOUR, dim=2
+    )
+    course = [lost(state) for state in tf.simulate(scene, until=0.5, dt=0.1)]
+    assert [k for k, gone in enumerate(course) if gone] == [2] and course[2] == [2]
+
+
+def test_cells_burst_at_their_rate():
+    """Of n cells n·exp(−rate·t) are left, within five standard deviations; type 1 has rate 0."""
+    many = tf.Cells([[9.0 * k, 0.0] for k in range(5000)], [[0.0, 1.0]] * 5000,
+                    cell_type=[0] * 4000 + [1] * 1000)  # fmt: skip
+    scene = tf.Scene(tf.Lysis(rate={0: 0.7, 1: 0.0}), founders=many, dim=2)
+    *_, state = tf.simulate(scene, until=2.0, dt=0.1, seed=5)
+    left = math.exp(-1.4)
+    kinds = state.cell_type.bincount().tolist()
+    assert kinds[1] == 1000
+    assert kinds[0] == pytest.approx(4000 * left, abs=5 * (4000 * left * (1 - left)) ** 0.5)
+
+
+def test_a_rate_holds_only_above_the_bound():
+    scene = tf.Scene(
+        holding(dilution=False, amount={0: 1.0, 1: 3.0}),
+        tf.Lysis(when="toxin", above=2.0, rate=1e6),
+        founders=tf.Cells(FOUR.position, FOUR.axis, cell_type=[0, 1, 1, 0]), dim=2,
+    )  # fmt: skip
+    assert step(scene, scene.bind().start(), 0.1).uid.tolist() == [0, 3]
+
+
+def test_who_bursts_does_not_depend_on_the_batch(tmp_path):
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2), holding(leaks),
+        tf.Lysis(rate=0.5, releases={"toxin": "toxin"}), medium("toxin"), founders=FOUR, dt=0.05,
+    )  # fmt: skip
+    *_, both = tf.simulate(scene, colonies=3, until=2.0, seed=2)
+    *_, alone = tf.simulate(scene, streams=[2], until=2.0, seed=2)
+    *_, half = tf.simulate(scene, streams=[2], until=1.0, seed=2)
+    *_, again = tf.simulate(scene, half, until=2.0)
+    own = both.select([2])
+    for other in (alone, again):
+        assert torch.equal(own.uid, other.uid) and torch.equal(own.position, other.position)
+        assert torch.equal(own.signals["toxin"], other.signals["toxin"])
+
+
+# --- what they release -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("apart", [5.0, 30.0])  # 30: two of three cells are beyond the box
+@pytest.mark.parametrize("exchange", ["turns", "together"])
+@pytest.mark.parametrize("rates", [stays, leaks])
+def test_what_cells_release_is_found_outside(rates, exchange, apart, device, dtype):
+    """Cells that leak, grow, divide and burst: nothing is lost, in a medium or a reservoir."""
+    cells = tf.Cells([[apart * k, 0.0] for k in range(-1, 2)], [[0.0, 1.0]] * 3)
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Division(length=4.0, conserves="volume"), tf.Mechanics(dim=2),
+        holding(rates, daughters="amount"), tf.Lysis(rate=1.0, releases={"toxin": "toxin"}),
+        medium("toxin", exchange=exchange, outside="reservoir"), founders=cells, dt=0.05,
+    )  # fmt: skip
+    state = scene.bind(3, seed=1, device=device, dtype=dtype).start()
+    whole, burst = totals(state, "toxin").tolist(), 0
+    for _ in range(30):
+        state = step(scene, state, 0.05)
+        burst += len(lost(state))
+    assert burst > 5 and state.cells
+    rounding = 3e-5 if dtype is F32 else 1e-12
+    assert totals(state, "toxin").tolist() == pytest.approx(whole, rel=rounding)
+    assert bool((state.fields["toxin_reservoir"] > 0).any()) == (apart > 20)
+
+
+def test_volumes_amounts_and_several_species(device, dtype):
+    def two(u, s, p, cell):
+        return {"a": 0.0 * u.a, "b": 0.0 * u.b}
+
+    scene = tf.Scene(
+        tf.Circuit(two, species=("a", "b"), initial={"a": 1.0, "b": 2.0}),
+        tf.Lysis(
+            when="b",
+            releases={"both": ("a", "b"), "debris": "volume", "phage": {0: 100.0, 1: 30.0}},
+        ),
+        medium("both", "debris", "phage"),
+        founders=tf.Cells(FOUR.position, FOUR.axis, length=2.0, cell_type=[0, 0, 0, 1]),
+    )  # fmt: skip
+    start = scene.bind(2, device=device, dtype=dtype).start()
+    volume = float(start.volume[:4].double().sum())
+    state = step(scene, start, 0.1)
+    assert state.cells == 0
+    for signal, amount in (("both", 3 * volume), ("debris", volume), ("phage", 330.0)):
+        found = totals(state, signal, inside=False)
+        assert found.tolist() == pytest.approx([amount] * 2, rel=1e-6)
+
+
+def test_what_is_released_lands_about_the_cell():
+    scene = tf.Scene(
+        holding(), tf.Lysis(when="toxin", releases={"toxin": "toxin"}), medium("toxin"),
+        founders=tf.Cells([[5.0, -7.0]], [[1.0, 0.0]]),
+    )  # fmt: skip
+    state = step(scene, scene.bind().start(), 0.1)
+    grid, found = state.layout.grid, state.signals["toxin"].double()
+    near = (found[:, None] * grid.centres()[:, :2].double()).sum(0) / found.sum()
+    assert near.tolist() == pytest.approx([5.0, -7.0], abs=1e-5)
+
+
+def test_corpses_feed_the_others():
+    """Biomass = what was released · yield: no more and no less."""
+    scene = tf.Scene(
+        tf.Growth(), tf.Monod("debris", rate=1.0, half=0.1, growth_yield=0.5), tf.Mechanics(dim=2),
+        tf.Rules(lambda c: setattr(c, "dying", (c.uid < 2).float()), variables={"dying": 0.0}),
+        tf.Lysis(when="dying", releases={"debris": "volume"}), medium("debris"), founders=FOUR,
+    )  # fmt: skip
+    first = scene.bind(dtype=torch.float64).start()
+    *_, state = tf.simulate(scene, until=6.0, dtype=torch.float64)
+    dead = float(first.volume[:2].sum())
+    left = float(totals(state, "debris", inside=False))
+    gained = float(state.volume.sum() - first.volume[2:].sum())
+    assert gained == pytest.approx(0.5 * (dead - left), rel=1e-9) and gained > 0.1
+
+
+def test_gradients_go_from_the_medium_to_what_cells_held():
+    def run(amount):
+        scene = tf.Scene(
+            holding(amount=amount), tf.Lysis(when="toxin", releases={"toxin": "toxin"}),
+            medium("toxin"), founders=FOUR,
+        )  # fmt: skip
+        model = scene.bind(1, dtype=torch.float64)
+        return totals(model.step(model.start(), 0.1), "toxin").sum()
+
+    amount = torch.tensor([5.0], dtype=torch.float64, requires_grad=True)
+    found = run(amount)
+    (slope,) = torch.autograd.grad(found, amount)
+    assert float(slope) == pytest.approx(float(found.detach()) / 5.0, rel=1e-9)
+
+
+# --- what goes with it -------------------------------------------------------------------
+
+
+def test_the_lineage_and_the_explanation_name_it(tmp_path):
+    def two(u, s, p, cell):
+        return {"a": 0.0 * u.a, "b": 0.0 * u.b}
+
+    scene = tf.Scene(
+        tf.Circuit(two, species=("a", "b"), initial={"a": 1.0}),
+        tf.Lysis(when="a", releases={"a": "a"}), medium("a"), founders=FOUR,
+    )  # fmt: skip
+    for _ in tf.simulate(scene, until=0.1, dt=0.05, record=tmp_path / "run.h5"):
+        pass
+    with tf.Results(tmp_path / "run.h5") as results:
+        assert list(results.lineage().fate) == ["lysed"] * 4
+    text = tf.explain(scene)
+    assert "in which a exceeds its bound" in text and "a gets a" in text
+    assert "lost with the cells: b" in text
+
+
+def test_a_search_grows_each_design_anew():
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2),
+        holding(makes, 0.0, k=1.0), tf.Lysis(when="toxin", above=2.0),
+    )  # fmt: skip
+    model = scene.bind(2)
+    assert {scene.effects[k].title for k in model.recorded} >= {"lysis", "circuit"}
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({}, "neither `when` nor `rate`"),
+        ({"when": "a b"}, "Lysis.when = 'a b' is not allowed: it must be the name of a species"),
+        ({"rate": -1.0}, "Lysis.rate"),
+        ({"when": "toxin", "releases": ["toxin"]}, "a dict of what goes to each signal"),
+        ({"when": "toxin", "releases": {"a b": "toxin"}}, "keys that name signals"),
+        ({"when": "toxin", "releases": {"toxin": ()}}, r"releases\['toxin'\] = \(\) is not"),
+        ({"when": "toxin", "releases": {"toxin": "2 + 2"}}, "a tuple of names, or an amount"),
+        ({"when": "toxin", "releases": {"toxin": -5.0}}, r"releases\['toxin'\]"),
+    ],
+)
+def test_bad_input(given, words):
+    with pytest.raises(tf.InputError, match=words):
+        tf.Lysis(**given)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"when": "toxn"}, "lysis needs the field 'toxn'"),
+        ({"when": "toxin", "releases": {"colicin": "toxin"}}, "the Medium has toxin"),
+        ({"when": "toxin", "releases": {"toxin": "colicin"}}, "lysis needs the field 'colicin'"),
+        ({"when": "displacement", "releases": {}}, "one number for each cell"),
+    ],
+)
+def test_names_that_a_scene_lacks(given, words):
+    with pytest.raises(tf.InputError, match=words):
+        tf.Scene(
+            holding(), tf.Lysis(**given), medium("toxin"), tf.Growth(rate=1.0),
+            tf.Mechanics(dim=2), founders=FOUR,
+        ).bind()  # fmt: skip
+
+
+def test_below_zero_nothing_is_released():
+    def fall(cells):
+        cells.store = cells.store - 1.0
+
+    scene = tf.Scene(
+        tf.Rules(fall, variables={"store": 0.5}), tf.Lysis(rate=1.0, releases={"toxin": "store"}),
+        medium("toxin"), founders=FOUR, dim=2,
+    )  # fmt: skip
+    with pytest.raises(tf.SimulationError, match=r"store of cell 0 .* must be at least 0"):
+        for _ in tf.simulate(scene, until=0.2):
+            pass
