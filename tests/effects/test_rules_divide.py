@@ -237,3 +237,28 @@ def test_what_divide_changes_in_place_is_written(in_place):
     by_type = scene.replace(tf.Growth(rate={0: 1.0}), tf.Rules(divide=divide), division)
     with pytest.raises(tf.InputError, match="growth_rate"):
         by_type.bind()
+
+
+def test_rules_follow_the_poles():
+    """Daughter 1 lies at the end to which the axis points back. After n divisions of a founder,
+    2^(n − k) cells have an older pole of age k, and 2 have one of age n; young poles face."""
+
+    def poles(parent, daughter1, daughter2):
+        daughter1.back, daughter1.front = parent.back + 1, 0
+        daughter2.back, daughter2.front = 0, parent.front + 1
+
+    scene = tf.Scene(
+        tf.Rules(None, poles, variables={"back": 0, "front": 0}),
+        tf.Growth(rate=1.0), tf.Division(length=4.0, axis_noise=0.0), tf.Mechanics(dim=2),
+    )  # fmt: skip
+    *_, state = tf.simulate(scene, cells=32)
+    older = torch.maximum(state.back, state.front).int()
+    assert older.bincount().tolist() == [0, 16, 8, 4, 2, 2]
+    assert bool((torch.minimum(state.back, state.front) == 0).all())
+    half = 0.5 * (state.length + 2 * state.radius).double().unsqueeze(1) * state.axis.double()
+    young = torch.where((state.front == 0).unsqueeze(1), half, -half) + state.position
+    order = state.parent.argsort(stable=True)
+    gap = (young[order[::2]] - young[order[1::2]]).norm(dim=1)
+    assert bool((state.parent[order[::2]] == state.parent[order[1::2]]).all())
+    # the step in which they divided has not moved them yet
+    assert float(gap.max()) < 1e-5
