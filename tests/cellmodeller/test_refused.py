@@ -243,6 +243,8 @@ def test_what_is_ignored_is_said(tmp_path):
         tf.from_cellmodeller(
             written(tmp_path, GROWS.replace("cellType=0,", "cellType=0, color=(1, 0, 0),"))
         )
+    with pytest.warns(UserWarning, match=r"addCell\(cellAdh=…\): CellModeller ignores"):
+        tf.from_cellmodeller(written(tmp_path, GROWS.replace("cellType=0,", "cellAdh=1,")))
     update = UPDATE + "        cell.radius = 2\n"
     with pytest.warns(UserWarning, match="cell by cell"):
         scene = tf.from_cellmodeller(written(tmp_path, HEAD + SETUP + INIT + update + DIVIDE))

@@ -135,7 +135,8 @@ class Simulator(_Recorder):
         cell: dict[str, Any] = {n: given.pop(n) for n in ("pos", "dir", "rad") if n in given}
         self._request.cells.append({"cellType": cellType, "length": length, **cell})
         self._request.ignored += [
-            f"addCell({name}=…): CellModeller ignores this option" for name in given
+            f"addCell({name}=…): CellModeller ignores this option"
+            for name in (*(["cellAdh"] if cellAdh else []), *given)
         ]
 
     def addRenderer(self, renderer: Any) -> None:
