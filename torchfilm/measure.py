@@ -1,5 +1,5 @@
 """Measures of a state: overlaps, forces on walls, radius, depth, alignment and strains per colony,
-growth rates and neighbour pairs."""
+pressure on cells, growth rates and neighbour pairs."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import torch
 from torch import Tensor
 
-from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.physics.contacts import CandidateContacts, Capsules, gaps_nearby
+from torchfilm.physics.near_rows import near_rows
 from torchfilm.physics.surfaces import FlatSurface
 from torchfilm.physics.wall_contacts import find_wall_contacts
 from torchfilm.physics.walls import Wall, depth_in_walls
@@ -20,7 +21,12 @@ from torchfilm.state import CELL, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.threads import one_torch_thread
-from torchfilm.tools.vectors import safe_norm
+from torchfilm.tools.vectors import cross, safe_norm
+
+if TYPE_CHECKING:
+    from torchfilm.scene import Scene
+
+END_ON = 1e-4  # squared sine of the angle between a cell and a force on its end
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -102,28 +108,116 @@ def wall_forces(state: State, walls: Sequence[Wall], dt: float) -> WallForces:
     colony.
     """
     _check_walls("wall_forces", walls)
-    dt = checks.number("wall_forces(dt)", dt, above=0.0)
+    soft = _softness("wall_forces", state, checks.number("wall_forces(dt)", dt, above=0.0))
+    surfaces = [s for wall in walls for s in wall.surfaces(state.dim)]
+    pushes = _pushed_by_walls(state, surfaces, soft)
+    assert pushes.surface is not None
+    at = state.colony.index_select(0, pushes.cell) * len(surfaces) + pushes.surface
+    force = Groups(at, state.colonies * len(surfaces)).sum(pushes.force.unsqueeze(1))
+    facing = tuple(s.normal if isinstance(s, FlatSurface) else None for s in surfaces)
+    return WallForces(force.view(state.colonies, len(surfaces)), facing)
+
+
+def _softness(measure: str, state: State, dt: float) -> Tensor:
+    """α Δt of each cell's contacts in a step of dt hours, or in its sub-steps, (N,): a contact
+    pushes with its overlap over this."""
     if "contact_alpha" not in state.fields:
         raise checks.InputError(
-            "wall_forces: the state has no contact_alpha, the softness of one-sided contacts:"
+            f"{measure}: the state has no contact_alpha, the softness of one-sided contacts:"
             " simulate with tf.Mechanics(contacts='one-sided'), the default."
         )
-    surfaces = [s for wall in walls for s in wall.surfaces(state.dim)]
-    if not surfaces:
-        return WallForces(state.length.new_zeros(state.colonies, 0, dtype=torch.float64), ())
-    placed = state.position, state.axis.double(), state.length.double(), state.radius.double()
-    rows = find_wall_contacts(surfaces, *placed, state.own_colony_id)
     report: Any = state.reports.get("mechanics")
     steps = 1 if report is None else state.groups.spread(report.substeps.clamp(min=1))
-    soft = state.contact_alpha.double() * (dt / steps)
+    return state.contact_alpha.double() * (dt / steps)
+
+
+@dataclass(frozen=True)
+class _Pushes:
+    """Forces on cells at contacts. cell: (K,) whom each pushes. force: (K,) μ·µm²/h. arm: (K,) µm,
+    how far the contact is from the cell's centre, along the force. surface: (K,) of which wall, or
+    None of pushes between cells."""
+
+    cell: Tensor
+    force: Tensor
+    arm: Tensor
+    surface: Tensor | None = None
+
+
+def _pushed_by_walls(state: State, surfaces: Sequence[Any], soft: Tensor) -> _Pushes:
+    """soft: as `_softness` says, (N,)."""
+    if not surfaces:
+        none = state.uid.new_empty(0)
+        return _Pushes(none, soft.new_empty(0), soft.new_empty(0), none)
+    length, radius = state.length.double(), state.radius.double()
+    placed = state.position, state.axis.double(), length, radius
+    rows = find_wall_contacts(surfaces, *placed, state.own_colony_id)
     # D² / (α Δt) of each cell at each surface: a stiffness
     hold = torch.stack([_held(s.wall, soft, state.own_colony_id) for s in surfaces])
     root = rows.row[:, : state.dim].norm(dim=1)
-    pushed = root * -rows.gap * hold[rows.surface, rows.cell]
-    at = state.colony.index_select(0, rows.cell) * len(surfaces) + rows.surface
-    force = Groups(at, state.colonies * len(surfaces)).sum(pushed.unsqueeze(1))
-    facing = tuple(s.normal if isinstance(s, FlatSurface) else None for s in surfaces)
-    return WallForces(force.view(state.colonies, len(surfaces)), facing)
+    force = root * -rows.gap * hold[rows.surface, rows.cell]
+    arm = radius[rows.cell] + (length[rows.cell] * rows.row[:, -1] + rows.gap) / root
+    return _Pushes(rows.cell, force, arm, rows.surface)
+
+
+@of_a_state
+@one_torch_thread()
+@torch.no_grad()
+def pressure(state: State, scene: Scene, dt: float | None = None) -> Tensor:
+    """The pressure on each cell in the last step, (N,) float64, by one-sided contacts.
+
+    It is that of the stress in the cell: the sum of force times the distance of the contact from
+    the cell's centre along the force, over d times the cell's volume; in a strictly two-dimensional
+    scene d = 2 and its area as seen from above, μ·µm/h, else d = 3, μ/h. Cells carry what the gaps
+    between them do not: in a full chamber the mean, weighted by size, is the pressure on the walls
+    over the share of the chamber that the cells fill. Overlaps give the forces with an error of
+    second order in dt: in a full chamber, where cells still shift, 5 % at 0.025 h, 0.5 % at
+    0.00625 h. dt: of the last step, h; by default that of the scene.
+    """
+    from torchfilm.scene import Scene  # it imports rooms that measure
+
+    if not isinstance(scene, Scene):
+        raise checks.input_error("pressure(scene)", scene, "the tf.Scene of the state")
+    soft = _softness("pressure", state, checks.number("pressure(dt)", dt or scene.dt, above=0.0))
+    surfaces = [s for e in scene.effects for s in e.wall_surfaces()]
+    soft_cells = any(e.soft_contacts for e in scene.effects)
+    total = torch.zeros_like(soft)
+    for pushes in (
+        *_pushed_by_cells(state, soft, soft_cells),
+        _pushed_by_walls(state, surfaces, soft),
+    ):
+        total.index_add_(0, pushes.cell, pushes.force * pushes.arm)
+    length, radius = state.length.double(), state.radius.double()
+    from_above = 2 * radius * length + torch.pi * radius**2
+    return total / (2 * from_above if state.dim == 2 else 3 * state.volume.double())
+
+
+def _pushed_by_cells(state: State, soft: Tensor, soft_cells: bool) -> tuple[_Pushes, _Pushes]:
+    """The pushes of a contact on its first cell and on its second. soft: as `_softness` says,
+    (N,)."""
+    axis, length, radius = state.axis.double(), state.length.double(), state.radius.double()
+    first, second, gap = gaps_nearby(
+        state.position, axis, length, radius, state.colony, state.colonies
+    )
+    deep = torch.nonzero(gap < 0).squeeze(1)
+    first, second = first.index_select(0, deep), second.index_select(0, deep)
+    start = state.position.index_select(0, state.groups.begin[:-1].index_select(0, state.colony))
+    capsules = Capsules((state.position - start).T, axis.T, 0.5 * length, radius)
+    margin = None if soft_cells else torch.zeros_like(gap.index_select(0, deep))
+    rows = near_rows(CandidateContacts.all_of(capsules, first, second), margin)
+    force = rows.weight * (-rows.gap).clamp(min=0) / soft.index_select(0, rows.first)
+
+    def on(cell: Tensor, row: Tensor) -> _Pushes:
+        normal, turn = row[:, : state.dim], row[:, state.dim : -1]
+        own = axis.index_select(0, cell)
+        # the turn is the arc length of the contact times this
+        across = cross(own.T, normal.T).T
+        square = across.square().sum(1)
+        along = (own * normal).sum(1) * (turn * across).sum(1) / square.clamp(min=1e-9)
+        # the end of a cell that is met head on
+        along = torch.where(square < END_ON, length[cell] * row[:, -1], along)
+        return _Pushes(cell, force, radius[cell] + along + 0.5 * rows.gap)
+
+    return on(rows.first, rows.row_first), on(rows.second, rows.row_second)
 
 
 def _held(wall: Wall, soft: Tensor, ids: Tensor) -> Tensor:
