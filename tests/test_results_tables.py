@@ -76,6 +76,23 @@ def test_internals_are_shown_on_request(whole):
     assert all(np.array_equal(table[name], every[name]) for name in table)
 
 
+@pytest.mark.parametrize("internals", [False, True])
+def test_the_table_of_a_state_is_that_of_its_frame(tmp_path, internals):
+    path, scene = tmp_path / "run.h5", designs()
+    last = record(scene, scene.bind(2).start(), path, until=1.0)[-1]
+    with tf.Results(path) as results:
+        recorded = results.table(-1, internals=internals)
+    found = tf.cell_table(last, internals=internals)
+    not_known = {"frame", "age", "born", "rate", "k", "Division.length"}
+    assert [n for n in recorded if n not in not_known] == list(found)
+    assert all(np.array_equal(recorded[n], x) for n, x in found.items())
+
+
+def test_a_table_is_of_a_state():
+    with pytest.raises(tf.InputError, match=r"cell_table\(state\) = 3 .*a tf\.State"):
+        tf.cell_table(3)
+
+
 def test_values_per_colony_come_back_as_columns(tmp_path):
     path, scene = tmp_path / "run.h5", designs()
     states = record(scene, scene.bind(2).start(), path, until=1.0)

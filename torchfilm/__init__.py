@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from torchfilm.explanation import explain
     from torchfilm.io.recorder import Recorder
     from torchfilm.io.results import Results
+    from torchfilm.io.table import cell_table
     from torchfilm.pictures import LivePlot, show
     from torchfilm.tuning.settings import Settings, preset
     from torchfilm.tuning.tuned import Tuned
@@ -62,6 +63,7 @@ _LAZY = {
     "LivePlot": "torchfilm.pictures",
     "Recorder": "torchfilm.io.recorder",
     "Results": "torchfilm.io.results",
+    "cell_table": "torchfilm.io.table",
     "explain": "torchfilm.explanation",
     "from_cellmodeller": "torchfilm.cellmodeller",
     "show": "torchfilm.pictures",
@@ -116,6 +118,7 @@ __all__ = [
     "Uniform",
     "__version__",
     "advance",
+    "cell_table",
     "checks",
     "digest",
     "displays",

@@ -77,6 +77,8 @@ class Effect(metaclass=checks.KnownKeywords):
     writes_anything: ClassVar[bool] = False
     # Kernels compute its steps on the CPU, with few operations of torch between them.
     by_kernels: ClassVar[bool] = False
+    # The first value that hints suggest for a variable that it needs.
+    usual_first: ClassVar[float] = 1.0
     # Its cost depends on the voxels of the grid, not on the cells.
     works_on_grid: ClassVar[bool] = False
 

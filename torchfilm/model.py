@@ -317,6 +317,13 @@ def why_not_replayable(model: Model) -> str:
     for e in model.effects:
         for f in e.declares():
             if f.scope != CELL and e.place in model.recorded:
+                for mover in model.effects:
+                    used = f.name in (*mover.reads(), *mover.writes())
+                    if used and {*mover.writes()} & {*BUILT_IN}:
+                        return (
+                            f"{mover.title} acts on growth or motion and needs {f.name!r}, which is"
+                            " no quantity of cells"
+                        )
                 return (
                     f"{e.effect.title} acts on growth or motion by {f.name!r}, which is no quantity"
                     " of cells"

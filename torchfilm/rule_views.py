@@ -90,6 +90,7 @@ class CellsView(Draws):
     _work: dict[str, Tensor]
     _read: set[str]
     _shown: dict[str, Tensor]
+    _given: dict[str, Tensor]  # the signals of what is shown
     _written: set[str]
     _declaring: bool
     _draws: int
@@ -106,19 +107,10 @@ class CellsView(Draws):
     ):
         # bypasses __setattr__, which is for rules
         self.__dict__.update(
-            _state=state,
-            _rows=None,
-            _purpose=label,
-            _dt=dt,
-            _work={},
-            _read=set(),
-            _shown={},
-            _written=set(),
-            _declaring=declaring,
-            _draws=0,
-            _draws_of={},
+            _state=state, _rows=None, _purpose=label, _dt=dt, _work={}, _read=set(), _shown={},
+            _given={}, _written=set(), _declaring=declaring, _draws=0, _draws_of={},
             _constants=constants,
-        )
+        )  # fmt: skip
 
     @property
     def time(self) -> float:
@@ -192,7 +184,11 @@ class CellsView(Draws):
         self._read.update(("position", *(n for n in state.fields if n.startswith(OUTSIDE))))
         contact = state.contact()
         assert contact is not None
-        return Names(tuple(contact.found), list(contact.found.values()), "cells.signals", SECRETES)
+        shown = []
+        for n, x in contact.found.items():
+            self._given[f"signals.{n}"] = x
+            shown.append(self._shown.setdefault(f"signals.{n}", x.clone()))
+        return Names(tuple(contact.found), shown, "cells.signals", SECRETES)
 
     def __setattr__(self, name: str, value: Any) -> None:
         name = PAPER_NAMES.get(name, name)
@@ -228,7 +224,7 @@ class CellsView(Draws):
             if name in OF_EFFECTS:
                 raise RuleError(f"cells.{name} acts only with {OF_EFFECTS[name]} in the scene.")
             near = difflib.get_close_matches(
-                name, [*state.fields, *KNOWN_FIELDS, "remove_flag", *PAPER_NAMES], 1, cutoff=0.85
+                name, [*state.fields, *KNOWN_FIELDS, "remove_flag", *PAPER_NAMES], 1, cutoff=0.82
             )
             if near:
                 raise RuleError(
@@ -278,7 +274,8 @@ class CellsView(Draws):
     def check_unharmed(self) -> None:
         """Raises RuleError if a rule wrote into a read-only name."""
         for name, shown in self._shown.items():
-            if not unchanged(shown, _quantity(self._state, name)):
+            given = self._given.get(name)
+            if not unchanged(shown, _quantity(self._state, name) if given is None else given):
                 raise RuleError(
                     f"the rule changed cells.{name} in place, which can only be read: rules change"
                     " fields, flags and variables."

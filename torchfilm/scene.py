@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -321,19 +321,22 @@ def _check_fields(effects: Sequence[Effect], dim: int, founders: Cells) -> dict[
                 raise checks.InputError(
                     f"{effect.title} needs the field {name!r}, which nothing in this scene"
                     f" provides. It has: {', '.join(declared) or 'no field'}."
-                    + _lacking_hint(name, declared)
+                    + _lacking_hint(effect, name, declared)
                 )
     return names
 
 
-def _lacking_hint(name: str, declared: Iterable[str]) -> str:
+def _lacking_hint(effect: Effect, name: str, declared: Collection[str]) -> str:
     """What to do where an effect needs a field that nothing provides."""
     if name.startswith(OUTSIDE):
         return _signal_hint(name.removeprefix(OUTSIDE), declared)
     if name in OF_EFFECTS:
         return f" List {OF_EFFECTS[name]} beside it."
-    first = f"tf.Rules(…, variables={{{name!r}: 1.0}})"
-    return f" A variable of rules needs a first value for it: {first}."
+    if OUTSIDE + name in declared:
+        return f" {name!r} is a signal: let a rule set a variable, cells.x = cells.signals.{name}."
+    near = checks.suggestion(name, declared)
+    first = f"tf.Rules(…, variables={{{name!r}: {effect.usual_first}}})"
+    return f"{near and f' {near}'} A variable of rules needs a first value for it: {first}."
 
 
 def _kept_twice(effect: Effect, value: str, field: str, other: str) -> str:

@@ -92,6 +92,59 @@ def test_a_rate_holds_only_above_the_bound():
     assert step(scene, scene.bind().start(), 0.1).uid.tolist() == [0, 3]
 
 
+def test_several_draw_each_for_itself():
+    """Two hazards add up, and each gets its share of the cells."""
+    many = tf.Cells([[9.0 * k, 0.0] for k in range(4000)], [[0.0, 1.0]] * 4000)
+    scene = tf.Scene(
+        tf.Lysis(rate=0.4, releases={"a": 1.0}), tf.Lysis(rate=0.2, releases={"b": 1.0}),
+        tf.Medium(
+            a=tf.Signal(diffusion=0.0), b=tf.Signal(diffusion=0.0),
+            box=[[-50.0, -50.0], [36050.0, 50.0]], spacing=50.0, depth=1.0,
+        ),
+        founders=many,
+    )  # fmt: skip
+    burst = 0
+    for state in tf.simulate(scene, until=2.0, dt=0.05, seed=5):
+        report = state.reports.get("lysis")
+        burst += 0 if report is None else int(report.burst)
+    left, gone = math.exp(-1.2), 1 - math.exp(-1.2)
+    deviation = (4000 * left * gone) ** 0.5
+    assert state.cells == pytest.approx(4000 * left, abs=5 * deviation)
+    assert burst == 4000 - state.cells
+    a, b = (float(totals(state, n, inside=False)) for n in "ab")
+    assert a + b == pytest.approx(burst, rel=1e-4)
+    # of the second the later draws are lost to the first of the same step: 1 % of them
+    assert b / burst == pytest.approx(1 / 3, abs=0.01 + 5 * (2 / 9 / burst) ** 0.5)
+
+
+def test_a_schedule_of_the_rate():
+    pulse = tf.Schedule({0: 0.0, 0.2: 1e6, 0.3: 0.0})
+    scene = tf.Scene(tf.Lysis(rate=pulse), founders=FOUR, dim=2)
+    course = [state.cells for state in tf.simulate(scene, until=0.5, dt=0.1)]
+    assert course == [4, 4, 0, 0, 0]
+    with pytest.warns(UserWarning, match=r"Lysis\.rate has the value of 0\.2 h in no step"):
+        for _ in tf.simulate(scene, until=0.3, dt=0.15):
+            pass
+
+
+@pytest.mark.parametrize("when", ["length", "volume"])
+def test_large_cells_burst(when):
+    cells = tf.Cells(FOUR.position, FOUR.axis, length=[1.0, 2.0, 3.0, 4.0])
+    above = 2.5 if when == "length" else 2.5 * math.pi * 0.25 + 4 / 3 * math.pi * 0.125
+    scene = tf.Scene(tf.Lysis(when, above=above), founders=cells, dim=2)
+    assert step(scene, scene.bind().start(), 0.1).uid.tolist() == [0, 1]
+
+
+def test_a_level_that_is_no_number_is_a_failure():
+    def lose(cells):
+        cells.a = torch.where(cells.colony == 1, math.nan, cells.a)
+
+    scene = tf.Scene(tf.Rules(lose, variables={"a": 0.0}), tf.Lysis("a"), founders=FOUR, dim=2)
+    with pytest.raises(tf.SimulationError, match=r"colony 1 .*: a, which decides which"):
+        for _ in tf.simulate(scene, until=0.2, colonies=2):
+            pass
+
+
 def test_who_bursts_does_not_depend_on_the_batch(tmp_path):
     scene = tf.Scene(
         tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2), holding(leaks),
@@ -152,6 +205,32 @@ def test_volumes_amounts_and_several_species(device, dtype):
     for signal, amount in (("both", 3 * volume), ("debris", volume), ("phage", 330.0)):
         found = totals(state, signal, inside=False)
         assert found.tolist() == pytest.approx([amount] * 2, rel=1e-6)
+
+
+def test_variables_are_amounts_and_bursts_are_drawn():
+    """A variable of rules is an amount; a drawn one is each cell's own, and kept from its birth."""
+    cells = tf.Cells(FOUR.position, FOUR.axis, extra={"phages": [5.0, 6.0, 7.0, 8.0]})
+    scene = tf.Scene(
+        tf.Rules(lambda c: None, variables={"phages": 0.0}),
+        tf.Lysis("phages", releases={"a": "phages", "b": tf.Uniform(50.0, 150.0)}),
+        medium("a", "b"), founders=cells,
+    )  # fmt: skip
+    start = scene.bind(3, dtype=torch.float64).start()
+    drawn = start.groups.sum(start.fields["lysis_releases_b"])
+    state = step(scene, start, 0.1)
+    assert totals(state, "a", inside=False).tolist() == pytest.approx([26.0] * 3)
+    assert totals(state, "b", inside=False).tolist() == pytest.approx(drawn.tolist())
+    assert len(set(drawn.tolist())) == 3
+    report = state.reports["lysis"]
+    assert report.burst.tolist() == [4] * 3
+    assert report.released["b"].tolist() == pytest.approx(drawn.tolist())
+
+
+@pytest.mark.parametrize("many", [[1.0, 2.0], torch.tensor([1.0, 2.0])])
+def test_amounts_by_colony(many):
+    scene = tf.Scene(tf.Lysis(rate=1e9, releases={"a": many}), medium("a"), founders=FOUR)
+    state = step(scene, scene.bind(2).start(), 0.1)
+    assert totals(state, "a", inside=False).tolist() == pytest.approx([4.0, 8.0])
 
 
 def test_what_is_released_lands_about_the_cell():
@@ -228,6 +307,8 @@ def test_a_search_grows_each_design_anew():
     ("given", "words"),
     [
         ({}, "neither `when` nor `rate`"),
+        ({"rate": 1.0, "above": 3.0}, "Lysis.above = 3.0 is not allowed: it must be given with"),
+        ({"when": "a", "releases": {"a": ("b", "b")}}, "a tuple of different names"),
         ({"when": "a b"}, "Lysis.when = 'a b' is not allowed: it must be the name of a species"),
         ({"rate": -1.0}, "Lysis.rate"),
         ({"when": "toxin", "releases": ["toxin"]}, "a dict of what goes to each signal"),
@@ -245,16 +326,22 @@ def test_bad_input(given, words):
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"when": "toxn"}, "lysis needs the field 'toxn'"),
-        ({"when": "toxin", "releases": {"colicin": "toxin"}}, "the Medium has toxin"),
+        (
+            {"when": "toxn"},
+            r"lysis needs the field 'toxn'.*Did you mean 'toxin'.*variables=\{'toxn': 0.0\}",
+        ),
+        ({"when": "toxin", "releases": {"colicin": "toxin"}}, "the Medium has toxin, ahl"),
         ({"when": "toxin", "releases": {"toxin": "colicin"}}, "lysis needs the field 'colicin'"),
+        ({"when": "age"}, "variable of rules"),
+        ({"when": "out"}, "variable of rules"),
+        ({"when": "ahl"}, r"'ahl' is a signal: let a rule .* cells.signals.ahl"),
         ({"when": "displacement", "releases": {}}, "one number for each cell"),
     ],
 )
 def test_names_that_a_scene_lacks(given, words):
     with pytest.raises(tf.InputError, match=words):
         tf.Scene(
-            holding(), tf.Lysis(**given), medium("toxin"), tf.Growth(rate=1.0),
+            holding(), tf.Lysis(**given), medium("toxin", "ahl"), tf.Growth(rate=1.0),
             tf.Mechanics(dim=2), founders=FOUR,
         ).bind()  # fmt: skip
 

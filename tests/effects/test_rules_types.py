@@ -292,3 +292,36 @@ def test_two_rules_draw_numbers_of_their_own():
     )  # fmt: skip
     drawn = state.x > 0
     assert int(drawn.sum()) == 8 and not bool((state.x == state.y)[drawn].any())
+
+
+def test_rules_of_one_name_draw_numbers_of_their_own():
+    """As functions made by one function do, in `update` and in `divide`."""
+
+    def made(name):
+        def rule(cells, *daughters):
+            for cell in daughters or (cells,):
+                setattr(cell, name, cell.random())
+
+        return rule
+
+    many = tf.Cells([[9.0 * k, 0.0] for k in range(50)], [[0.0, 1.0]] * 50, length=3.9)
+    for rules in (
+        [tf.Rules(made(n), variables={n: 0.0}) for n in "xyz"],
+        [tf.Rules(None, made(n), variables={n: 0.0}) for n in "xyz"],
+    ):
+        scene = tf.Scene(*rules, tf.Growth(rate=1.0), tf.Division(length=4.0), dim=2, founders=many)
+        *_, state = tf.simulate(scene, until=0.1)
+        drawn = torch.stack([state.x, state.y, state.z])[:, state.parent >= 0]
+        assert drawn.shape[1] == 100 and len(drawn.unique()) == 300
+
+
+def test_signals_can_only_be_read():
+    def eats(cells):
+        cells.mark = cells.signals.food * 1.0
+        cells.signals.food.mul_(0.0)
+
+    medium = tf.Medium(
+        food=tf.Signal(diffusion=1.0, initial=1.0), box=[[-9, -9], [9, 9]], spacing=3.0, depth=1.0
+    )
+    with pytest.raises(tf.InputError, match=r"changed cells\.signals\.food in place"):
+        tf.Scene(tf.Rules(eats, variables={"mark": 0.0}), medium, dim=2).bind()

@@ -91,7 +91,7 @@ def _after_divide(
     divide: Callable[..., None], rule: DivisionRule, state: State, births: Births
 ) -> tuple[DivisionView, DivisionView, DivisionView]:
     """The views of parent, first and second daughter, after the rule."""
-    label = label_of(divide)  # two rules draw numbers of their own
+    label = rule.label(divide, "divide")
 
     def view(state: State, rows: Tensor | None, called: str, which: str) -> DivisionView:
         purpose = f"{label} divide {which}"

@@ -16,6 +16,7 @@ from torchfilm.effect import (
     CIRCUIT,
     DIVISION,
     GRID_COVERAGE,
+    LYSIS,
     Binding,
     BoundEffect,
     ExchangePlan,
@@ -127,9 +128,11 @@ class FirstHalf(_MediumPart):
 
 class BoundMedium(_MediumPart):
     """Transports signals after exchange with the cells: over the second half of a step, or all.
-    solves_together: whether circuits and transport of what they exchange are one equation."""
+    solves_together: whether circuits and transport of what they exchange are one equation. found:
+    the signals that cells may find; None: not known yet."""
 
     solves_together = False
+    found: frozenset[str] | None = None
 
     def declares(self) -> list[Field]:
         first = self.transport.first
@@ -168,6 +171,14 @@ class BoundMedium(_MediumPart):
         eaters = [e for e in others if e.moves_signals]
         eaten = exchanged(eaters)
         given = exchanged(circuits)
+        # what bursts gives, and finds nothing
+        given_by_burst = {n for e in others if e.stage == LYSIS for n in e.writes()}
+        for e in others:
+            if e.effect.writes_anything:
+                given_by_burst.clear()
+            if e.stage != LYSIS:
+                given_by_burst -= {*e.reads(), *e.writes()}
+        self.found = frozenset(n for n in self.effect.signals if OUTSIDE + n not in given_by_burst)
         why = next((why for e in circuits if e.exchanges() and (why := e.why_turns)), "")
         if both := [n for n in given if n in eaten]:
             why = f"Nutrition moves {both[0]}, and a circuit exchanges it, too."
@@ -205,7 +216,8 @@ class BoundMedium(_MediumPart):
         return self.transport.carried(state, dt, part, 2 if self.effect.halves else 1, names)
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        return self.effect.numerics(dt, state, self.transport.in_turns, self.transport.coupled)
+        moved = self.transport.in_turns, self.transport.coupled
+        return self.effect.numerics(dt, state, *moved, found=self.found)
 
 
 class GridCoverage(_MediumPart):

@@ -110,6 +110,17 @@ class BoundRule(BoundEffect):
         self.least_zero = {n for e in effects for n in e.effect.at_least_zero()}
         self.by_type = kept_by_type(effects)
 
+    def label(self, rule: Callable[..., None], name: str) -> str:
+        """A label that gives this rule, the "update" or "divide" of its effect, random numbers of
+        its own; also where functions of several Rules of the scene have one name."""
+        label, alike = label_of(rule), 0
+        for other in self.others:
+            if other is self:
+                break
+            own = other.source.functions[name] if type(other) is type(self) else None
+            alike += own is not None and label_of(own) == label
+        return f"{label} {alike}" if alike else label
+
     def _check_written(self, read: Collection[str], written: Collection[str]) -> None:
         """Raise InputError, or warn, as at binding, where the function writes what it did not write
         before: after an edit, or in a branch that its trial did not take."""
@@ -283,7 +294,8 @@ class BoundRules(BoundRule):
         return self.source.call("update", partial(self._apply, state, dt), state)
 
     def _apply(self, state: State, dt: float, update: Callable[[CellsView], None]) -> State:
-        view = CellsView(state, dt, label_of(update), constants=self.constants(state))
+        label = self.label(update, "update")
+        view = CellsView(state, dt, label, constants=self.constants(state))
         act(update, view)
         work = dict(view._work)
         gone = work.pop("remove_flag", None)

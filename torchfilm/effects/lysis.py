@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,47 +12,81 @@ from torch import Tensor
 from torchfilm.effect import LYSIS, Binding, BoundEffect, Effect
 from torchfilm.medium_exchange import MediumExchange
 from torchfilm.resolver import Values
+from torchfilm.signals.schedule import warn_of_steps
 from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.random import fine_uniform
 from torchfilm.values import CONCENTRATION, Rule, Value, checked, physical
 
-AMOUNT = Rule("conc·µm³", least=0.0)
-VOLUME = "volume"
+AMOUNT = Rule("conc·µm³", least=0.0, scheduled=True)
+LENGTH, VOLUME = "length", "volume"
+
+
+@dataclass(frozen=True)
+class LysisReport:
+    """`burst` (B,): how many cells burst in this step. `released`: what they gave to each signal,
+    (B,) conc·µm³ by its name. `status` (B,): 1 where `when` is not a number in a cell."""
+
+    status: Tensor
+    burst: Tensor
+    released: Mapping[str, Tensor]
+    when: str | None
+    hint = "Let the rule, or the circuit, give it a number in every cell"
+
+    def reason(self, place: int) -> str:
+        return f"{self.when}, which decides which cells burst, is not a number in a cell"
+
+    def after(self, earlier: LysisReport) -> LysisReport:
+        """With what another Lysis did earlier in the same step."""
+        both = dict(earlier.released)
+        for name, amount in self.released.items():
+            both[name] = both[name] + amount if name in both else amount
+        status = torch.maximum(earlier.status, self.status)
+        when = self.when if bool(self.status.any()) else earlier.when
+        return LysisReport(status, earlier.burst + self.burst, both, when)
 
 
 @dataclass(frozen=True, eq=False)
 class Lysis(Effect):
     """Cells burst: they are removed, and what they hold goes to the medium about them.
 
-    A cell bursts at the end of the step in which `when` exceeds `above`; with a `rate`, 1/h, it
-    does so at that rate as long as it exceeds it. Without `when` all cells burst at the rate.
+    A cell bursts at the end of the step in which `when` exceeds `above` (by default 0); with a
+    `rate`, 1/h, it does so at that rate as long as it exceeds it. Without `when` all cells burst at
+    the rate.
 
-    when: name of a species of a circuit, or of another variable of the cells, such as rules set.
-    above, rate: a number, one per colony, one per cell type, or a distribution drawn at birth.
-    releases: what goes to each signal of the Medium, by the signal's name: the name of a species or
-    variable (its concentration times the cell's volume is released), "volume" (one unit of
-    concentration times the volume), a tuple of such names, or an amount per cell in conc·µm³.
-    What it does not name is lost with the cell; `explain` lists the species that are.
+    when: name of a species of a circuit, or of a variable with a first value, such as
+    tf.Rules(…, variables={"lysing": 0.0}) has; or "length" or "volume". above, rate: a number, one
+    per colony, one per cell type, a distribution drawn at birth, or a Schedule.
 
-    The lineage keeps the end of these cells, with the fate "lysed". Transport spreads what they
-    released from the next step on.
+    releases: what goes to each signal of the Medium, by the signal's name: the name of a species
+    (its concentration times the cell's volume is released) or of a variable of rules (its value, an
+    amount in conc·µm³), "volume" (one unit of concentration times the volume), a tuple of such
+    names, or an amount per cell in conc·µm³, given as `rate` is. What it does not name is lost with
+    the cell; `explain` lists the species that are.
+
+    The lineage keeps the end of these cells, with the fate "lysed"; `state.reports["lysis"]` counts
+    them. Transport spreads what they released from the next step on.
     """
 
     when: str | None = None
-    above: Value = physical(0.0)
-    rate: Value | None = physical(None, unit="1/h", least=0.0)
+    above: Value | None = physical(None, scheduled=True)
+    rate: Value | None = physical(None, unit="1/h", least=0.0, scheduled=True)
     releases: Mapping[str, Any] | None = None
 
     stage = LYSIS
     title = "lysis"
     by_kernels = True
+    usual_first = 0.0
 
     def __post_init__(self) -> None:
         if self.when is None and self.rate is None:
             raise checks.InputError(
                 "Lysis has neither `when` nor `rate`: it needs the name of a species or variable"
                 ' that decides which cells burst, such as when="lysis_protein", or a rate, 1/h.'
+            )
+        if self.when is None and self.above is not None:
+            raise checks.input_error(
+                "Lysis.above", self.above, "given with `when`, the name of what is to exceed it"
             )
         if self.when is not None and not _is_name(self.when):
             raise checks.input_error(
@@ -63,21 +97,24 @@ class Lysis(Effect):
                 "Lysis.releases", self.releases,
                 'a dict of what goes to each signal, such as {"colicin": "colicin"}',
             )  # fmt: skip
-        kept = {}
-        for signal, what in (self.releases or {}).items():
-            path = f"Lysis.releases[{signal!r}]"
-            if not _is_name(signal):
-                raise checks.input_error("Lysis.releases", signal, "keys that name signals")
-            names = what if isinstance(what, tuple | list) else (what,)
-            if names and all(_is_name(n) for n in names):
-                kept[signal] = tuple(names)
-            elif isinstance(what, str | tuple | list):
-                raise checks.input_error(
-                    path, what, 'the name of a species, "volume", a tuple of names, or an amount'
-                )
-            else:
-                kept[signal] = checked(path, what, AMOUNT)
+        kept = {s: self._checked_release(s, what) for s, what in (self.releases or {}).items()}
         object.__setattr__(self, "releases", kept)
+
+    def _checked_release(self, signal: object, what: Any) -> Any:
+        """A tuple of names, or a checked amount."""
+        path = f"Lysis.releases[{signal!r}]"
+        if not _is_name(signal):
+            raise checks.input_error("Lysis.releases", signal, "keys that name signals")
+        names = tuple(what) if isinstance(what, tuple | list) else (what,)
+        if names and all(map(_is_name, names)):
+            if len(set(names)) < len(names):
+                raise checks.input_error(path, what, "a tuple of different names")
+            return names
+        if isinstance(what, str) or not names or any(isinstance(n, str) for n in names):
+            raise checks.input_error(
+                path, what, 'the name of a species, "volume", a tuple of names, or an amount'
+            )
+        return checked(path, what, AMOUNT)
 
     @property
     def _named(self) -> dict[str, tuple[str, ...]]:
@@ -85,25 +122,26 @@ class Lysis(Effect):
         assert self.releases is not None
         return {s: what for s, what in self.releases.items() if isinstance(what, tuple)}
 
-    def _variables(self) -> tuple[str, ...]:
-        """The species and variables that it reads."""
-        decides = () if self.when is None else (self.when,)
-        return tuple(dict.fromkeys((*decides, *self.at_least_zero())))
-
     def at_least_zero(self) -> tuple[str, ...]:
         return tuple(n for names in self._named.values() for n in names if n != VOLUME)
+
+    def _variables(self) -> tuple[str, ...]:
+        """The species and variables that it reads."""
+        decides = () if self.when in (None, LENGTH, VOLUME) else (str(self.when),)
+        return tuple(dict.fromkeys((*decides, *self.at_least_zero())))
 
     def physical_values(self) -> dict[str, tuple[Any, Rule]]:
         assert self.releases is not None
         amounts = {
-            f"releases[{s!r}]": (x, AMOUNT)
+            f"releases[{s}]": (x, AMOUNT)
             for s, x in self.releases.items()
             if not isinstance(x, tuple)
         }
         return {**self.physical_fields(), **amounts}
 
     def reads(self) -> tuple[str, ...]:
-        return ("position", "length", "radius") if self.releases else ()
+        sized = self.releases or self.when in (LENGTH, VOLUME)
+        return (*(["position"] if self.releases else []), *(["length", "radius"] if sized else []))
 
     def needs(self) -> tuple[str, ...]:
         assert self.releases is not None
@@ -116,6 +154,10 @@ class Lysis(Effect):
     def bind(self, binding: Binding) -> tuple[BoundEffect, ...]:
         return (BoundLysis(self, binding),)
 
+    def check_step(self, dt: float, divides: bool) -> None:
+        given = {name: value for name, (value, _) in self.physical_values().items()}
+        warn_of_steps("Lysis", given, dt)
+
     def check(self, state: State, values: Values) -> None:
         for name in self._variables():
             declared = state.declared[name]
@@ -127,6 +169,11 @@ class BoundLysis(BoundEffect):
     """Lysis bound to a batch; it also writes the reservoirs' fields, if there are some."""
 
     effect: Lysis
+    number = 0  # of those before it in the scene
+
+    def check_others(self, effects: Sequence[BoundEffect]) -> None:
+        alike = [e for e in effects if isinstance(e, BoundLysis)]
+        self.number = alike.index(self)
 
     def _reservoirs(self) -> tuple[str, ...]:
         assert self.effect.releases is not None
@@ -147,11 +194,7 @@ class BoundLysis(BoundEffect):
         named = [f"{s} gets {' and '.join(names)}" for s, names in effect._named.items()]
         given = [f"{s} gets an amount" for s in effect.releases if s not in effect._named]
         released = {n for names in effect._named.values() for n in names}
-        lost = [
-            n
-            for n, field in state.declared.items()
-            if field.scope == CELL and field.unit == CONCENTRATION and n not in released
-        ]
+        lost = [n for n in state.fields if _is_species(state, n) and n not in released]
         lines = [f"at the end of the step{asked}{chance}; before cells divide"]
         if effect.releases:
             lines.append(f"released at once, exactly: {'; '.join(named + given)}")
@@ -161,50 +204,76 @@ class BoundLysis(BoundEffect):
 
     def step(self, state: State, dt: float) -> State:
         """The state without the cells that burst, and with what they released."""
-        bursts = self._bursts(state, dt)
-        if not bool(bursts.any()):
-            return state
-        if self.effect.releases:
-            state = self._released(state, bursts)
-        return state.remove(bursts, "lysed")
+        effect, (bursts, unknown) = self.effect, self._bursts(state, dt)
+        released: dict[str, Tensor] = {}
+        gone = bool(bursts.any())
+        if gone and effect.releases:
+            state, released = self._released(state, bursts)
+        burst = state.groups.sum(bursts.double()).long() if gone else torch.zeros_like(unknown)
+        report = LysisReport(unknown, burst, released, effect.when)
+        earlier = state.reports.get(effect.title)
+        if self.number and isinstance(earlier, LysisReport):
+            report = report.after(earlier)
+        state = state.replace(reports={**state.reports, effect.title: report})
+        return state.remove(bursts, "lysed") if gone else state
 
-    def _bursts(self, state: State, dt: float) -> Tensor:
-        """Which cells burst in this step, (N,) bool."""
+    def _bursts(self, state: State, dt: float) -> tuple[Tensor, Tensor]:
+        """Which cells burst in this step, (N,) bool, and in which colonies `when` is not a number,
+        (B,) int64."""
         effect, values = self.effect, self.values
         bursts = torch.ones(state.cells, dtype=torch.bool, device=state.device)
+        unknown = torch.zeros_like(state.counts)
         if effect.when is not None:
-            bursts = state.fields[effect.when] > values.above.of_cells(state)
+            level = _quantity(state, effect.when)
+            unknown = state.groups.any(level.isnan()).long()
+            bursts = level > (0.0 if effect.above is None else values.above.of_cells(state))
         if effect.rate is None:
-            return bursts
+            return bursts, unknown
         rows = torch.arange(state.cells, device=state.device)
-        coarse, fine = (state.uniform(rows, f"{effect.value_owner()} {k}") for k in range(2))
+        purpose = effect.value_owner() + (f" {self.number}" if self.number else "")
+        coarse, fine = (state.uniform(rows, f"{purpose} {k}") for k in range(2))
         chance = -torch.expm1(-values.rate.of_cells(state).double() * dt)
-        return bursts & (fine_uniform(coarse, fine) < chance)
+        return bursts & (fine_uniform(coarse, fine) < chance), unknown
 
-    def _released(self, state: State, bursts: Tensor) -> State:
+    def _released(self, state: State, bursts: Tensor) -> tuple[State, dict[str, Tensor]]:
+        """The state whose medium has what these cells release, and the sums by colony and
+        signal."""
         effect = self.effect
         assert effect.releases is not None
         burst = state.take(torch.nonzero(bursts).squeeze(1))
         medium = MediumExchange(burst, tuple(effect.releases))
         medium.find()
-        away = medium.in_reservoir
+        away, total = medium.in_reservoir, {}
         for signal, what in effect.releases.items():
             amount = self._amount(burst, signal, what).to(state.dtype).expand(burst.cells)
+            total[signal] = burst.groups.sum(amount.detach().double())
             if away is None:
                 medium.give(signal, amount, None)
             else:
                 near, far = (torch.where(there, amount, 0.0) for there in (~away, away))
                 medium.give(signal, near, far)
         settled = medium.settle().fields
-        return state.with_fields(**{n: settled[n] for n in self.writes() if n != "cells"})
+        changed = {n: settled[n] for n in self.writes() if n != "cells"}
+        return state.with_fields(**changed), total
 
     def _amount(self, state: State, signal: str, what: Any) -> Tensor:
         """What a cell that bursts releases to a signal, conc·µm³, (N,) or one number."""
         if not isinstance(what, tuple):
-            return self.values[f"releases[{signal!r}]"].of_cells(state)
-        volume = state.volume
-        held = [volume if n == VOLUME else state.fields[n] * volume for n in what]
+            return self.values[f"releases[{signal}]"].of_cells(state)
+        held = [
+            _quantity(state, n) * (state.volume if _is_species(state, n) else 1.0) for n in what
+        ]
         return torch.stack(held).sum(0)
+
+
+def _quantity(state: State, name: str) -> Tensor:
+    return getattr(state, name) if name in (LENGTH, VOLUME) else state.fields[name]
+
+
+def _is_species(state: State, name: str) -> bool:
+    """Whether it is a concentration in each cell."""
+    declared = state.declared.get(name)
+    return declared is not None and declared.scope == CELL and declared.unit == CONCENTRATION
 
 
 def _is_name(given: object) -> bool:

@@ -265,9 +265,11 @@ class Medium(Effect):
         state: State,
         exchanged: Collection[str] = frozenset(),
         coupled: Mapping[str, str] | None = None,
+        found: Collection[str] | None = None,
     ) -> list[str]:
         """exchanged: the signals that cells and transport move in turns, `steps` of them. coupled:
-        those that others move, by whom; these describe it themselves."""
+        those that others move, by whom; these describe it themselves. found: those that cells may
+        find; by default all."""
         coupled = coupled or {}
         assert state.layout is not None
         shape, spacing = state.layout.grid.shape[0].tolist(), state.layout.grid.spacing
@@ -303,7 +305,8 @@ class Medium(Effect):
             who = self.backend_on(state.device) if method in COMPILED else "torch"
             who = "compiled; by torch where gradients are required" if who == "compiled" else who
             lines.append(f"{name}: {method}, {order} ({why}), {who}; dt·K/h² = {ratio}")
-            lines += self._cost_of_turns(name, dt, state, name in exchanged)
+            if found is None or name in found:
+                lines += self._cost_of_turns(name, dt, state, name in exchanged)
         return lines
 
     def _cost_of_turns(self, name: str, dt: float, state: State, often: bool) -> list[str]:
@@ -359,8 +362,8 @@ def _stays_0(name: str) -> str:
     return (
         f"the signal {name!r} of the Medium is 0 and stays 0: no effect gives it, and it has no"
         " source, no first value, and no face or reservoir that supplies it. Let cells give it (the"
-        f" second dict of a circuit, {{{name!r}: …}}), write {name}=tf.Signal(…, source=…) or"
-        " initial=…, or leave it out."
+        f" second dict of a circuit, {{{name!r}: …}}, or tf.Lysis(releases=…)), write"
+        f" {name}=tf.Signal(…, source=…) or initial=…, or leave it out."
     )
 
 

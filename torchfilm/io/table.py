@@ -1,8 +1,8 @@
-"""The table of a run: one row per cell and frame, one column per quantity."""
+"""The table of a run or a state: one row per cell and frame, one column per quantity."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,8 @@ import torch
 
 from torchfilm.io.parameters import column_names
 from torchfilm.physics import capsule
-from torchfilm.state import OUTSIDE
+from torchfilm.state import CELL, COLONY, OUTSIDE, State
+from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError, install
 
 if TYPE_CHECKING:
@@ -63,31 +64,71 @@ class Tables:
             found = {name: x[rows] for name, x in found.items()}
             signals = {name: x[rows] for name, x in signals.items()}
         place, time = found["colony"], float(results.times[k])
-        ids = results.colony_id[place]
-        born = self.lineage.born_of(ids, found["uid"])
+        found |= {"colony": results.colony_id[place]}
+        born = self.lineage.born_of(found["colony"], found["uid"])
         columns = {
             "frame": np.full(len(place), k),
-            "time": np.full(len(place), time),
-            "colony": ids,
-            "cell": found["uid"],
-            "parent": found["parent"],
-            **_pose(found["position"], found["axis"], self.internals),
-            "length": found["length"],
-            "radius": found["radius"],
-            "volume": _volume(found["length"], found["radius"]),
+            **_of_cells(time, found, self.internals),
             "age": time - born,
             "born": born,
         }
-        fields = {**found, **{n: x[place] for n, x in results.colony_fields(k).items()}}
+        fields = found | {n: x[place] for n, x in results.colony_fields(k).items()}
         hidden = set() if self.internals else results.internal_fields
-        for name in sorted(fields.keys() - hidden - set(GIVEN)):
-            columns |= _components(f"field.{name}" if name in OWN else name, fields[name])
-        for name, value in signals.items():
-            columns[OUTSIDE + name] = value
+        columns |= _of_fields({n: x for n, x in fields.items() if n not in hidden}, signals)
         values = results.parameters(k)
         for path, name in column_names(list(values), set(columns)).items():
             columns[name] = values[path][place]
         return columns
+
+
+@checks.known_keywords
+def cell_table(state: State, *, internals: bool = False) -> dict[str, np.ndarray]:
+    """The cells of a state, one row per cell and one column per quantity, each (N,):
+    `pandas.DataFrame(tf.cell_table(state))`.
+
+    The columns are those of `Results.table`, but for frame, age and born, which a state does not
+    know, and parameters. internals: with the axis, and with the fields that serve the numerics.
+    """
+    if not isinstance(state, State):
+        raise checks.input_error("cell_table(state)", state, "a tf.State")
+    on_cpu = lambda x: x.detach().cpu().numpy()
+    found = {"uid": state.uid, "colony": state.own_colony_id, "parent": state.parent}
+    found |= {n: getattr(state, n) for n in ("position", "axis", "length", "radius")}
+    for name, value in state.fields.items():
+        declared = state.declared[name]
+        if declared.scope in (CELL, COLONY) and (internals or not declared.internal):
+            per_cell = declared.scope == CELL
+            found[name] = value if per_cell else value.index_select(0, state.colony)
+    contact = state.contact()
+    signals = {} if contact is None else {n: on_cpu(x) for n, x in contact.found.items()}
+    columns = {n: on_cpu(x) for n, x in found.items()}
+    return _of_cells(state.time, columns, internals) | _of_fields(columns, signals)
+
+
+def _of_cells(
+    time: float, found: Mapping[str, np.ndarray], internals: bool
+) -> dict[str, np.ndarray]:
+    """The columns that all cells have."""
+    return {
+        "time": np.full(len(found["uid"]), time),
+        "colony": found["colony"],
+        "cell": found["uid"],
+        "parent": found["parent"],
+        **_pose(found["position"], found["axis"], internals),
+        "length": found["length"],
+        "radius": found["radius"],
+        "volume": _volume(found["length"], found["radius"]),
+    }
+
+
+def _of_fields(
+    fields: Mapping[str, np.ndarray], signals: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """The columns of fields, and of the signals at the cells."""
+    columns: dict[str, np.ndarray] = {}
+    for name in sorted(fields.keys() - set(GIVEN)):
+        columns |= _components(f"field.{name}" if name in OWN else name, fields[name])
+    return columns | {OUTSIDE + name: value for name, value in signals.items()}
 
 
 def _pose(position: np.ndarray, axis: np.ndarray, internals: bool) -> dict[str, np.ndarray]:

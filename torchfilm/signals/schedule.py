@@ -31,8 +31,8 @@ class Schedule(metaclass=checks.KnownKeywords):
 
     A medium takes one in place of a source, a flow, a reservoir or the value at a face, with the
     value that holds as a step begins. A circuit takes one as a constant: `p.light` of
-    `Circuit(…, light=schedule)` has the value of the middle of a step. In rules,
-    `schedule(cells.time)` is that of its beginning.
+    `Circuit(…, light=schedule)` has the value of the middle of a step. In `Lysis`, and in rules as
+    `schedule(cells.time)`, it is that of its beginning.
     """
 
     values: Mapping[float, Any]
