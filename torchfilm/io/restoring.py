@@ -1,13 +1,16 @@
-"""From a recorded frame back to a state that `simulate` can continue."""
+"""From a recorded frame back to a state that `simulate` can continue, or to cells that another
+scene starts from."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.initial_cells import Cells
 from torchfilm.io.identity import check_fields, check_same_scene, declared_fields
 from torchfilm.model import bind
 from torchfilm.scene import Scene
@@ -18,6 +21,23 @@ from torchfilm.tools.warn_once import quietly
 
 if TYPE_CHECKING:
     from torchfilm.io.results import Results
+
+# Fields that a scene sets for its own cells, and that would overrule those of another scene.
+SET_BY_EFFECTS = ("growth_rate", "division_threshold", "birth_length")
+
+
+def cells_of(results: Results, frame: int, fields: Sequence[str] | None) -> Cells:
+    """The cells of a frame; see `Results.cells`."""
+    found = results.frame(frame)
+    own = ("position", "axis", "length", "radius", "colony", "cell_type")
+    serving = {*results.internal_fields, "uid", "parent", *own}
+    known = {n: v for n, v in found.items() if n not in serving and v.ndim == 1}
+    for name in known if fields is None else fields:
+        checks.choice("fields", name, tuple(known))
+    usual = [n for n in known if n not in SET_BY_EFFECTS and not n.endswith("_eaten")]
+    extra = {n: known[n] for n in (usual if fields is None else fields)}
+    columns: dict[str, Any] = {n: found.get(n) for n in own}
+    return Cells(**columns, extra=extra)
 
 
 def restore_state(

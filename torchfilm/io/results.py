@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from torchfilm.initial_cells import Cells
+from torchfilm.io.card import card
 from torchfilm.io.identity import check_same_scene, declared_fields
 from torchfilm.io.layout import AT_CELLS, INTERNAL_BEFORE, INTERNAL_ENDING_BEFORE
 from torchfilm.io.lineage import Lineage
@@ -27,15 +28,13 @@ from torchfilm.io.reading import (
     read_attribute,
     read_dataset,
 )
-from torchfilm.io.restoring import restore_state
+from torchfilm.io.restoring import cells_of, restore_state
 from torchfilm.io.table import Tables, data_frame
 from torchfilm.scene import Scene
 from torchfilm.state import State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.checks import InputError
 
-# Fields that a scene sets for its own cells, and that would overrule those of another scene.
-SET_BY_EFFECTS = ("growth_rate", "division_threshold", "birth_length")
 BY_NUMBER = {
     "time": "Frames go by number: int(abs(results.times - t).argmin()) is the one nearest to t h."
 }
@@ -86,21 +85,7 @@ class Results(metaclass=checks.KnownKeywords):
         return f"Results({str(self.path)!r}, {colonies}, {frames}{when})"
 
     def _repr_html_(self) -> str:
-        if not self.file:
-            return displays.card(repr(self))
-        attributes, hidden = self.attributes, self.internal_fields
-        about = [("scene", str(attributes["scene"]).splitlines()[0])]
-        if len(self):
-            about += [
-                ("cells", f"{self.counts[0].sum()} at first, {self.counts[-1].sum()} at last")
-            ]
-        about += [
-            ("fields", ", ".join(n for n in self._names("cells") if n not in hidden)),
-            ("signals", ", ".join(self.signal_names)),
-            ("seed", str(attributes["seed"])),
-            ("torchfilm", str(attributes["torchfilm"])),
-        ]
-        return displays.card(repr(self), displays.pairs((n, v) for n, v in about if v))
+        return card(self, self._names("cells")) if self.file else displays.card(repr(self))
 
     def _read(self, name: str, at: int | slice | EllipsisType = ...) -> Any:
         return read_dataset(self.file, name, at)
@@ -216,16 +201,7 @@ class Results(metaclass=checks.KnownKeywords):
         have; by default species and variables, and neither what growth and division set for each
         cell themselves, such as `growth_rate`, nor what serves the numerics. Raises InputError for
         other names."""
-        found = self.frame(frame)
-        own = ("position", "axis", "length", "radius", "colony", "cell_type")
-        serving = {*self.internal_fields, "uid", "parent", *own}
-        known = {n: v for n, v in found.items() if n not in serving and v.ndim == 1}
-        for name in known if fields is None else fields:
-            checks.choice("fields", name, tuple(known))
-        usual = [n for n in known if n not in SET_BY_EFFECTS and not n.endswith("_eaten")]
-        extra = {n: known[n] for n in (usual if fields is None else fields)}
-        columns: dict[str, Any] = {n: found.get(n) for n in own}
-        return Cells(**columns, extra=extra)
+        return cells_of(self, frame, fields)
 
     def colony_fields(self, frame: int = -1) -> dict[str, np.ndarray]:
         """The fields per colony of one frame by name, each (B, …)."""
