@@ -24,6 +24,7 @@ CUT = 4.0  # σ of the optics, beyond which no light arrives
 MARGIN = 2.0  # µm around the cells, where no window is given
 MOST_PIXELS = 2**28  # of one page
 PROFILES = ("thickness", "flat")
+DYE = 300.0  # counts per µm of cell, where no channels are given
 Window = tuple[tuple[float, float], tuple[float, float]]
 
 
@@ -191,15 +192,15 @@ class Camera:
         seen = seen[inside, inside] + self.background
         if self.noise is None:
             return (seen + self.offset).astype(np.float32)
-        _check_counts(name, float(seen.max()) + self.offset)
+        check_counts(name, float(seen.max()) + self.offset)
         draw = np.random.default_rng([self.seed, *key, *name.encode()])
         counts = draw.poisson(seen) + draw.normal(self.offset, self.noise, seen.shape)
-        _check_counts(name, float(counts.max()))
+        check_counts(name, float(counts.max()))
         # a camera shows no count below 0
         return np.maximum(np.round(counts), 0).astype(np.uint16)
 
 
-def _check_counts(name: str, most: float) -> None:
+def check_counts(name: str, most: float) -> None:
     """Raise InputError where the brightest pixel of a channel does not fit into 16 bits."""
     if round(most) > np.iinfo(np.uint16).max:
         raise InputError(
@@ -219,27 +220,34 @@ def write_fluorescence(
     """As `Results.to_ome_tiff`."""
     target = check_new_file(path, SUFFIXES, overwrite, view.results.path)
     checks.choice("profile", profile, PROFILES)
-    gains = _check_channels(view, channels)
-    steps = view.results.steps
-    raster = view.raster.wider(camera.margin(view.raster.pixel))
+    gains = check_channels(view, channels)
+    pages = light_images(view, gains, profile, camera)
+    return _write(view, target, pages, camera.dtype, list(gains))
 
-    def pages() -> Iterator[np.ndarray]:
-        for k in view.frames:
-            columns, rods = view.cells(k)
+
+def light_images(
+    view: View, gains: Mapping[str, float] | None, profile: str, camera: Camera
+) -> Iterator[np.ndarray]:
+    """Counts (rows, columns) of each frame, and in it of each channel of `gains`; without them, of
+    one dye that all cells hold alike, `DYE` counts per µm of cell."""
+    raster, steps = view.raster.wider(camera.margin(view.raster.pixel)), view.results.steps
+    names = list(gains or ["dye"])
+    for k in view.frames:
+        columns, rods = view.cells(k)
+        weights = np.full((1, len(rods.half)), DYE)
+        if gains is not None:
             weights = np.stack([g * columns[n].astype(float) for n, g in gains.items()])
-            bad = ~(weights >= 0).all(1)
-            if bad.any():
-                rule = "a quantity that is known and at least 0 in all cells"
-                raise checks.input_error("channels", list(gains)[int(bad.argmax())], rule)
-            light = thickness_image(rods, weights, raster, profile == "flat")
-            for name, image in zip(gains, light, strict=True):
-                key = (view.colony, int(steps[k]))
-                yield camera.image(image, raster.pixel, key, name)
-
-    return _write(view, target, pages(), camera.dtype, list(gains))
+        bad = ~(weights >= 0).all(1)
+        if bad.any():
+            rule = "a quantity that is known and at least 0 in all cells"
+            raise checks.input_error("channels", names[int(bad.argmax())], rule)
+        light = thickness_image(rods, weights, raster, profile == "flat")
+        for name, image in zip(names, light, strict=True):
+            yield camera.image(image, raster.pixel, (view.colony, int(steps[k])), name)
 
 
-def _check_channels(view: View, channels: Any) -> dict[str, float]:
+def check_channels(view: View, channels: Any) -> dict[str, float]:
+    """The gains by the names of their columns. Raises InputError for what is no such dict."""
     if not isinstance(channels, Mapping) or not channels:
         rule = "a dict of quantities per cell with their gains, such as {'gfp': 100.0}"
         raise checks.input_error("channels", channels, rule)
