@@ -140,12 +140,12 @@ def test_what_does_not_fit_is_named(run, tmp_path, name, options, message):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
-@pytest.mark.parametrize("suffix", [".csv", ".vtkhdf", ".nwk", ".graphml", ".tif", ".ome.tif"])
+@pytest.mark.parametrize("suffix", [".csv", ".vtkhdf", ".nwk", ".graphml", ".tif", ".ome.tif", ""])
 def test_damaged_results_are_named(run, tmp_path, share, suffix):
     data = run.read_bytes()
     (tmp_path / "cut.h5").write_bytes(data[: int(share * len(data))])
     out = tmp_path / f"a{suffix}"
-    image = {"pixel_size": 0.1, "colonies": [0]} if "tif" in suffix else {}
+    image = {"pixel_size": 0.1, "colonies": [0]} if suffix in ("", ".tif", ".ome.tif") else {}
     light = {"channels": ["gfp=1"]} if suffix == ".ome.tif" else {}
     with pytest.raises(tf.InputError, match=r"cut\.h5"):
         Export(tmp_path / "cut.h5", out, **image, **light)()

@@ -19,6 +19,7 @@ from torchfilm.tools.checks import InputError
 TABLE, NEWICK, GRAPH, VTK = ".csv", ".nwk", ".graphml", ".vtkhdf"
 IMAGES = (".tif", ".tiff")
 SUFFIXES = (TABLE, NEWICK, GRAPH, VTK, *IMAGES)
+FOLDER = ""  # ground truth for segmentation and tracking is a folder, which has no suffix
 # Options of each format, beside --overwrite.
 PAGES = ("frames", "colonies", "pixel_size", "window")
 LIGHT = ("channels", "blur", "noise", "background", "offset", "profile", "seed")
@@ -29,6 +30,7 @@ OPTIONS: dict[str, tuple[str, ...]] = {
     VTK: ("frames", "colonies", "rods"),
     "label masks": (*PAGES, "z"),
     "fluorescence": (*PAGES, *LIGHT),
+    FOLDER: (*PAGES, "z", *LIGHT),
 }
 
 
@@ -37,12 +39,13 @@ class Export:
     """Write results for other programs. The suffix of the new file says the format: .csv, the
     table of cells; .vtkhdf, for ParaView and pyvista; .tif or .ome.tif, label masks, or
     fluorescence where --channels are given; .nwk, the lineage in Newick format; .graphml, the
-    lineage as a graph."""
+    lineage as a graph. A name without a dot, such as ctc/, is a folder in the format of the Cell
+    Tracking Challenge: images, label masks and tracks."""
 
     file: Annotated[Path, tyro.conf.Positional]
     """Results file."""
     out: Annotated[Path, tyro.conf.Positional]
-    """The new file: NAME.csv, .vtkhdf, .tif, .ome.tif, .nwk or .graphml."""
+    """The new file: NAME.csv, .vtkhdf, .tif, .ome.tif, .nwk or .graphml; or the new folder."""
     frames: list[str] = field(default_factory=list)
     """Which frames, such as --frames 0 10 -1, or ranges START:STOP or START:STOP:STEP as in Python,
     such as --frames 2:5 or --frames=-3:; by default all. (Not .nwk, .graphml.)"""
@@ -54,10 +57,11 @@ class Export:
     window: list[float] = field(default_factory=list)
     """Images: the part to show, as LEFT BOTTOM RIGHT TOP, µm; by default the colony."""
     z: float | None = None
-    """Label masks in space: height of the section, µm."""
+    """Label masks and folders, in space: height of the section, µm."""
     channels: list[str] = field(default_factory=list)
     """Fluorescence: quantities and gains, as NAME=GAIN, such as --channels gfp=100 rfp=50: counts
-    per µm of cell and unit of the quantity."""
+    per µm of cell and unit of the quantity. Folders: one, by default a dye that all cells hold
+    alike."""
     blur: float | None = None
     """Fluorescence: σ of the optics, µm; by default 0."""
     noise: float | None = None
@@ -77,14 +81,13 @@ class Export:
     internals: bool = False
     """.csv: with the fields that serve the numerics."""
     overwrite: bool = False
-    """Replace the file if it exists."""
+    """Replace the file or the folder if it exists."""
 
     def __call__(self) -> None:
         suffix = self.out.suffix.lower()
-        if suffix not in SUFFIXES:
-            raise checks.input_error(
-                "OUT", str(self.out), f"a name that ends in {', '.join(SUFFIXES)}"
-            )
+        if suffix not in (*SUFFIXES, FOLDER):
+            rule = f"a name that ends in {', '.join(SUFFIXES)}, or that of a folder, without a dot"
+            raise checks.input_error("OUT", str(self.out), rule)
         form = suffix
         if suffix in IMAGES:
             form = "fluorescence" if self.channels else "label masks"
@@ -96,6 +99,7 @@ class Export:
             VTK: self._vtk,
             "label masks": self._labels,
             "fluorescence": self._fluorescence,
+            FOLDER: self._folder,
         }
         with Results(self.file) as results:
             for path in writers[form](results):
@@ -104,6 +108,9 @@ class Export:
             print(
                 "label masks, in which a cell is its number + 1; for fluorescence give --channels"
             )
+        if form == FOLDER:
+            what = "images, label masks and tracks" if self.z is None else "label masks and tracks"
+            print(f"{what}; cells.csv says which cell a label is")
 
     def _check_options(self, form: str) -> None:
         """Raise InputError for options that this format does not have."""
@@ -174,10 +181,23 @@ class Export:
         return [results.to_labels(self.out, z=self.z, **self._pages(results))]
 
     def _fluorescence(self, results: Results) -> list[Path]:
-        names = ("blur", "noise", "background", "offset", "profile", "seed")
-        light = {n: getattr(self, n) for n in names if getattr(self, n) is not None}
-        gains = dict(map(_gain, self.channels))
-        return [results.to_ome_tiff(self.out, channels=gains, **self._pages(results), **light)]
+        return [results.to_ome_tiff(self.out, **self._pages(results), **self._light())]
+
+    def _folder(self, results: Results) -> list[Path]:
+        if self.pixel_size is None:
+            raise InputError(
+                f"{self.out} has no suffix, so it is to be a folder in the format of the Cell"
+                " Tracking Challenge, which needs --pixel-size, µm, such as --pixel-size 0.065."
+                f" Files end in {', '.join(SUFFIXES)}."
+            )
+        return [results.to_ctc(self.out, z=self.z, **self._pages(results), **self._light())]
+
+    def _light(self) -> dict[str, Any]:
+        """The options of LIGHT that are given."""
+        found = {n: getattr(self, n) for n in LIGHT if getattr(self, n) not in (None, [])}
+        if self.channels:
+            found["channels"] = dict(map(_gain, self.channels))
+        return found
 
     def _pages(self, results: Results) -> dict[str, Any]:
         if self.pixel_size is None:
@@ -225,6 +245,5 @@ def _gain(text: str) -> tuple[str, float]:
 
 
 def _content(form: str) -> str:
-    return {TABLE: "the table", NEWICK: "the lineage", GRAPH: "the lineage", VTK: "shapes"}.get(
-        form, form
-    )
+    known = {TABLE: "the table", NEWICK: "the lineage", GRAPH: "the lineage", VTK: "shapes"}
+    return {**known, FOLDER: "images, label masks and tracks"}.get(form, form)

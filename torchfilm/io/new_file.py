@@ -1,8 +1,10 @@
-"""New files for other programs: where they may be written, and how they come to be there whole."""
+"""New files and folders for other programs: where they may be written, and how they come to be
+there whole."""
 
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -50,6 +52,54 @@ def written_whole(path: Path) -> Iterator[Path]:
         raise SimulationError(f"could not write {path}: {error}. {why}") from error
     finally:
         beside.unlink(missing_ok=True)
+
+
+def check_new_folder(path: str | Path, parts: tuple[str, ...], overwrite: bool) -> Path:
+    """The path of a folder to be made, with `parts` in it, of which the last says that it is such a
+    folder. Raises InputError for a path without a name or in a folder that does not exist, for a
+    file, and for a folder that holds anything; with `overwrite`, for one that holds other things
+    than such parts."""
+    found = Path(path)
+    if found.name in ("", ".."):
+        raise checks.input_error("path", str(path), "the name of a folder, such as 'ctc'")
+    if not found.parent.is_dir():
+        hint = f"Make {found.parent} first."
+        raise checks.input_error("path", str(path), "in a folder that exists", hint)
+    if found.exists() and not found.is_dir():
+        raise checks.input_error("path", str(path), "a folder, not a file")
+    held = sorted(p.name for p in found.iterdir()) if found.exists() else []
+    if held and not overwrite:
+        rule = "a path where there is nothing yet, or an empty folder"
+        hint = "Choose another, or replace it: overwrite=True, or --overwrite."
+        raise checks.input_error("path", str(path), rule, hint)
+    if held and (parts[-1] not in held or not {*held} <= {*parts}):
+        rule = f"a folder that holds {', '.join(parts)} and nothing else, where it is replaced"
+        raise checks.input_error("path", str(path), rule, f"It holds {', '.join(held[:5])}.")
+    return found
+
+
+@contextmanager
+def folder_written_whole(path: Path) -> Iterator[Path]:
+    """A new folder beside `path`, which it replaces at the end. An error or a kill before leaves
+    what was at `path`. Raises SimulationError where something cannot be written."""
+    target = path.resolve()
+    beside, old = (target.with_name(f".{target.name}.{word}") for word in ("new", "old"))
+    try:
+        for left in (beside, old):
+            shutil.rmtree(left, ignore_errors=True)
+        beside.mkdir()
+        yield beside
+        if target.exists():
+            os.replace(target, old)
+        os.replace(beside, target)
+    except OSError as error:
+        why = why_not_written(error)
+        raise SimulationError(f"could not write {path}: {error}. {why}") from error
+    finally:
+        if old.exists() and not target.exists():
+            os.replace(old, target)
+        for left in (beside, old):
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def check_frames(count: int, frames: object, path: Path) -> list[int]:

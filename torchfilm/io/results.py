@@ -382,6 +382,42 @@ class Results(metaclass=checks.KnownKeywords):
         view = view_of(self, pixel_size, colony, frames, window, None, section=False)
         return write_fluorescence(view, path, channels, profile, camera, overwrite)
 
+    @checks.known_keywords
+    def to_ctc(
+        self,
+        path: str | Path,
+        *,
+        pixel_size: float,
+        channels: Mapping[str, float] | None = None,
+        blur: float = 0.0,
+        noise: float | None = None,
+        background: float = 0.0,
+        offset: float = 100.0,
+        profile: str = "thickness",
+        colony: int | None = None,
+        frames: Sequence[int] | None = None,
+        window: tuple[tuple[float, float], tuple[float, float]] | None = None,
+        z: float | None = None,
+        seed: int = 0,
+        overwrite: bool = False,
+    ) -> Path:
+        """Write one colony as ground truth for segmentation and tracking: a folder in the format of
+        the Cell Tracking Challenge. Requires the extra `images`.
+
+        01: images as of `to_ome_tiff`, rounded; channels: one, by default a dye of which all cells
+        hold the same concentration, 300 counts per µm. 01_GT/TRA and 01_GT/SEG: masks as of
+        `to_labels`, and man_track.txt. cells.csv: the cell of each label, which is its number plus
+        1 where possible. A cell without pixels has no label in that frame; later it goes on under a
+        new one. In space there are no images. Raises InputError for what does not fit, and for more
+        than 65535 labels.
+        """
+        from torchfilm.io.cell_tracking import write_ctc
+        from torchfilm.io.microscopy import Camera, view_of
+
+        camera = Camera(blur, background, offset, noise, seed)
+        view = view_of(self, pixel_size, colony, frames, window, z, section=True)
+        return write_ctc(view, path, channels, profile, camera, overwrite)
+
     @partial(checks.known_keywords, instead=BY_NUMBER)
     def state(
         self,
