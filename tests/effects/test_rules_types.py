@@ -195,6 +195,32 @@ def test_an_inherited_trait_spreads_as_a_random_walk():
     assert len(last.trait.unique()) == last.cells
 
 
+def test_rates_that_are_inherited_in_part():
+    """The recipe of docs/rules.md: mother and daughter correlate by c, sisters by c²."""
+    c, pairs = 0.6, []
+
+    def inherit(parent, daughter1, daughter2):
+        for daughter in (daughter1, daughter2):
+            pull = c * (parent.growth_rate - 1.0)
+            noise = 0.1 * (1 - c**2) ** 0.5 * daughter.normal()
+            daughter.growth_rate = 1.0 + pull + noise
+        pairs.append([parent.growth_rate, daughter1.growth_rate, daughter2.growth_rate])
+
+    many = tf.Cells([[9.0 * k, 0.0] for k in range(3000)], [[0.0, 1.0]] * 3000, length=3.9)
+    scene = tf.Scene(
+        tf.Rules(None, inherit), tf.Growth(rate=tf.Normal(1.0, 0.1)), tf.Division(length=4.0),
+        dim=2, founders=many,
+    )  # fmt: skip
+    *_, last = tf.simulate(scene, until=0.1)
+    assert last.cells == 6000
+    mother, one, two = (torch.cat(x).double() for x in zip(*pairs[1:], strict=True))
+    error = 5 / 3000**0.5
+    assert float(torch.corrcoef(torch.stack([mother, one]))[0, 1]) == pytest.approx(c, abs=error)
+    assert float(torch.corrcoef(torch.stack([one, two]))[0, 1]) == pytest.approx(c * c, abs=error)
+    for x in (mother, one, two):
+        assert float(x.std()) == pytest.approx(0.1, rel=error)
+
+
 def test_plasmids_go_to_one_daughter_or_the_other():
     def part(parent, daughter1, daughter2):
         k = parent.binomial(parent.plasmids, 0.5)
