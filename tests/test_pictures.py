@@ -327,6 +327,20 @@ def test_a_frame_without_cells_is_reported(tmp_path):
         sheet(cells_of(empty), tmp_path / "a.png")
 
 
+@pytest.mark.parametrize("style", [{"background": "food"}, {"whole": True}])
+def test_the_box_is_drawn_also_where_all_cells_are_gone(style, tmp_path):
+    medium = tf.Medium(
+        food=tf.Signal(diffusion=1.0, initial=1.0), box=[[-9, -9], [9, 9]], spacing=3.0, depth=1.0
+    )
+    scene = tf.Scene(tf.Lysis(rate=1e9, releases={"food": "volume"}), medium, dim=2)
+    *_, state = tf.simulate(scene, until=0.025)
+    assert state.cells == 0
+    for colour in (None, "length"):
+        tf.show(state, scene=scene, colour=colour, out=tmp_path / "a.png", **style)
+    with pytest.raises(tf.InputError, match="no cell to draw.*background"):
+        tf.show(state, scene=scene)
+
+
 def test_a_place_that_is_not_there_is_reported(recorded, tmp_path):
     with pytest.raises((tf.InputError, FileNotFoundError), match="nowhere"):
         tf.show(recorded, out=tmp_path / "nowhere" / "a.png")

@@ -121,7 +121,10 @@ def _one_time(
     dpi: float,
 ) -> Figure:
     """Colonies at one time. heading: the words before the time, where there is no title."""
-    places, more = choose_colonies(frame.counts > 0, frame.colony_id, colonies, most)
+    boxed = (style.background is not None or style.whole) and frame.origin is not None
+    # the box of a medium is seen also where all cells are gone
+    present = np.ones_like(frame.counts, dtype=bool) if boxed else frame.counts > 0
+    places, more = choose_colonies(present, frame.colony_id, colonies, most)
     if title is not None and not isinstance(title, str):
         raise checks.input_error("title", title, "text")
     if title is None:
@@ -286,7 +289,7 @@ def choose_colonies(
     if not alive:
         raise checks.InputError(
             "this frame has no cell to draw: its colonies have lost all cells. Draw an earlier one"
-            " (frame=…, --frame)."
+            " (frame=…, --frame), or a signal (background=…, --background)."
         )
     if colonies is None:
         notes = [f"first {most} of {len(alive)} colonies"] if len(alive) > most else []

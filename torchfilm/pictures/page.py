@@ -156,7 +156,8 @@ def _windows(
     shown = (
         {place: _union(covered.get(place), boxes[place]) for place in places}
         if style.whole
-        else covered
+        # the box, where all cells are gone
+        else {place: covered[place] if place in covered else boxes[place] for place in places}
     )
     sizes = []
     for place in places:
