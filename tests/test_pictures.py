@@ -337,7 +337,7 @@ def test_the_box_is_drawn_also_where_all_cells_are_gone(style, tmp_path):
     assert state.cells == 0
     for colour in (None, "length"):
         tf.show(state, scene=scene, colour=colour, out=tmp_path / "a.png", **style)
-    with pytest.raises(tf.InputError, match="no cell to draw.*background"):
+    with pytest.raises(tf.InputError, match=r"no cell to draw.*background"):
         tf.show(state, scene=scene)
 
 
