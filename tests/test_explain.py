@@ -243,6 +243,7 @@ def test_every_effect_that_torchfilm_has_is_known_and_has_words():
         tf.Circuit(plain, species="m"),
         medium(),
         tf.Lysis(rate=0.1),
+        tf.MediumReactions(lambda s, p: {"ahl": -s.ahl}),
         tf.Removal((-50, -50), (50, 50)),
     ).bind()
     state = model.start()

@@ -14,6 +14,7 @@ from torchfilm.effects.growth import Growth
 from torchfilm.effects.lysis import Lysis
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.medium import Medium
+from torchfilm.effects.medium_reactions import MediumReactions
 from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
@@ -92,6 +93,7 @@ __all__ = [
     "Lysis",
     "Mechanics",
     "Medium",
+    "MediumReactions",
     "Model",
     "Monod",
     "NoFlux",

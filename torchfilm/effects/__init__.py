@@ -7,6 +7,7 @@ from torchfilm.effects.growth import Growth
 from torchfilm.effects.lysis import Lysis
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.medium import Medium
+from torchfilm.effects.medium_reactions import MediumReactions
 from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
@@ -18,6 +19,7 @@ KNOWN = {
     "growth": Growth,
     "mechanics": Mechanics,
     "circuit": Circuit,
+    "medium reactions": MediumReactions,
     "transport": Medium,
     "lysis": Lysis,
     "division": Division,
