@@ -325,6 +325,11 @@ def test_a_folder_is_replaced_whole_or_not_at_all(run, tmp_path, monkeypatch):
     folder = run.to_ctc(tmp_path / "ctc", **COMMON)
     with pytest.raises(tf.InputError, match="overwrite"):
         run.to_ctc(folder, **few)
+    notes = folder / "01" / "notes.txt"
+    notes.write_text("mine")
+    with pytest.raises(tf.InputError, match=r"and nothing else.*It holds 01/notes\.txt"):
+        run.to_ctc(folder, **few, overwrite=True)
+    notes.unlink()
     write = cell_tracking._write_page
 
     def fail(path, *rest):

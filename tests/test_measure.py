@@ -237,8 +237,13 @@ def test_cells_of_a_full_chamber_carry_what_gaps_do_not(dim, filled):
 
 def test_pressure_of_cells_apart_and_of_what_is_no_scene():
     scene = tf.Scene(tf.Mechanics(dim=2), founders=tf.Cells([[0, 0], [5.0, 0]], [[0, 1.0]] * 2))
-    state = scene.bind(2).start()
+    *_, state = tf.simulate(scene, until=0.05, colonies=2)
     assert tf.measure.pressure(state, scene).tolist() == [0.0] * 4
+    with pytest.raises(tf.InputError, match=r"pressure\(dt\) = 0"):
+        tf.measure.pressure(state, scene, dt=0)
+    for unknown in (state.select([0]), scene.bind().start()):
+        with pytest.raises(tf.InputError, match="in how many sub-steps"):
+            tf.measure.pressure(unknown, scene)
     with pytest.raises(tf.InputError, match=r"pressure\(scene\) = .*the tf.Scene of the state"):
         tf.measure.pressure(state, [])
     with pytest.raises(tf.InputError, match="contact_alpha"):
@@ -248,7 +253,7 @@ def test_pressure_of_cells_apart_and_of_what_is_no_scene():
 def test_forces_need_one_sided_contacts_and_plain_stiffness():
     wall = tf.Plane(y=-2.0, facing="+y", stiffness={0: 10.0})
     both = (tf.Mechanics(dim=2, contacts="bilateral"), tf.Mechanics(dim=2, walls=[wall]))
-    states = [tf.Scene(m).bind().start() for m in both]
+    states = [list(tf.simulate(tf.Scene(m), until=0.025))[-1] for m in both]
     with pytest.raises(tf.InputError, match="contact_alpha"):
         tf.measure.wall_forces(states[0], [tf.Plane(y=-2.0, facing="+y")], 0.025)
     with pytest.raises(tf.InputError, match=r"Plane\.stiffness.*one number"):

@@ -88,6 +88,13 @@ def test_the_table_of_a_state_is_that_of_its_frame(tmp_path, internals):
     assert all(np.array_equal(recorded[n], x) for n, x in found.items())
 
 
+def test_a_table_may_be_changed_and_its_state_not():
+    state = tf.scenes.microcolony().bind(2).start()
+    for column in tf.cell_table(state, internals=True).values():
+        column[:] = 9
+    assert float(state.length.max()) < 9 and state.parent.tolist() == [-1, -1]
+
+
 def test_a_table_is_of_a_state():
     with pytest.raises(tf.InputError, match=r"cell_table\(state\) = 3 .*a tf\.State"):
         tf.cell_table(3)

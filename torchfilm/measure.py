@@ -127,8 +127,13 @@ def _softness(measure: str, state: State, dt: float) -> Tensor:
             " simulate with tf.Mechanics(contacts='one-sided'), the default."
         )
     report: Any = state.reports.get("mechanics")
-    steps = 1 if report is None else state.groups.spread(report.substeps.clamp(min=1))
-    return state.contact_alpha.double() * (dt / steps)
+    if report is None:
+        raise checks.InputError(
+            f"{measure}: the state does not say in how many sub-steps its contacts were solved."
+            " Give it as a step returns it: not a first one, nor one from a file or by select."
+        )
+    steps = state.groups.spread(report.substeps.clamp(min=1))
+    return state.contact_alpha.double() * dt / steps
 
 
 @dataclass(frozen=True)
@@ -172,20 +177,23 @@ def pressure(state: State, scene: Scene, dt: float | None = None) -> Tensor:
     over the share of the chamber that the cells fill. Overlaps give the forces with an error of
     second order in dt: in a full chamber, where cells still shift, 5 % at 0.025 h, 0.5 % at
     0.00625 h. dt: of the last step, h; by default that of the scene.
+
+    Raises InputError for bilateral contacts, and for a state that is not as a step returned it: it
+    lacks the number of sub-steps.
     """
     from torchfilm.scene import Scene  # it imports rooms that measure
 
     if not isinstance(scene, Scene):
         raise checks.input_error("pressure(scene)", scene, "the tf.Scene of the state")
-    soft = _softness("pressure", state, checks.number("pressure(dt)", dt or scene.dt, above=0.0))
+    dt = checks.number("pressure(dt)", scene.dt if dt is None else dt, above=0.0)
+    soft = _softness("pressure", state, dt)
     surfaces = [s for e in scene.effects for s in e.wall_surfaces()]
     soft_cells = any(e.soft_contacts for e in scene.effects)
     total = torch.zeros_like(soft)
-    for pushes in (
-        *_pushed_by_cells(state, soft, soft_cells),
-        _pushed_by_walls(state, surfaces, soft),
-    ):
-        total.index_add_(0, pushes.cell, pushes.force * pushes.arm)
+    at_walls = _pushed_by_walls(state, surfaces, soft)
+    for pushes in (*_pushed_by_cells(state, soft, soft_cells), at_walls):
+        virial = (pushes.force * pushes.arm).unsqueeze(1)
+        total = total + Groups(pushes.cell, state.cells).sum(virial).squeeze(1)
     length, radius = state.length.double(), state.radius.double()
     from_above = 2 * radius * length + torch.pi * radius**2
     return total / (2 * from_above if state.dim == 2 else 3 * state.volume.double())

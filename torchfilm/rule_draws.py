@@ -55,7 +55,8 @@ class Draws:
         wrong = ~((expected >= 0) & expected.isfinite())
         if bool(wrong.any()):
             raise RuleError(
-                f"poisson was given the mean {expected[wrong][0]:g}: it must be 0 or more"
+                f"poisson was given the mean {expected[wrong][0]:g}: it must be finite, and 0 or"
+                " more"
             )
         return poisson(expected, fine).to(self._state.dtype)
 

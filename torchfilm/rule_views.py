@@ -91,6 +91,7 @@ class CellsView(Draws):
     _read: set[str]
     _shown: dict[str, Tensor]
     _given: dict[str, Tensor]  # the signals of what is shown
+    _around: Names | None
     _written: set[str]
     _declaring: bool
     _draws: int
@@ -108,7 +109,7 @@ class CellsView(Draws):
         # bypasses __setattr__, which is for rules
         self.__dict__.update(
             _state=state, _rows=None, _purpose=label, _dt=dt, _work={}, _read=set(), _shown={},
-            _given={}, _written=set(), _declaring=declaring, _draws=0, _draws_of={},
+            _given={}, _around=None, _written=set(), _declaring=declaring, _draws=0, _draws_of={},
             _constants=constants,
         )  # fmt: skip
 
@@ -181,14 +182,17 @@ class CellsView(Draws):
         state = self._state
         if state.layout is None:
             raise RuleError("cells have no signals: this scene has no Medium.")
-        self._read.update(("position", *(n for n in state.fields if n.startswith(OUTSIDE))))
-        contact = state.contact()
-        assert contact is not None
-        shown = []
-        for n, x in contact.found.items():
-            self._given[f"signals.{n}"] = x
-            shown.append(self._shown.setdefault(f"signals.{n}", x.clone()))
-        return Names(tuple(contact.found), shown, "cells.signals", SECRETES)
+        if self._around is None:
+            self._read.update(("position", *(n for n in state.fields if n.startswith(OUTSIDE))))
+            contact = state.contact()
+            assert contact is not None
+            shown = [x.clone() for x in contact.found.values()]
+            for (n, x), own in zip(contact.found.items(), shown, strict=True):
+                self._given[f"signals.{n}"], self._shown[f"signals.{n}"] = x, own
+            made = Names(tuple(contact.found), shown, "cells.signals", SECRETES)
+            self.__dict__["_around"] = made
+        assert self._around is not None
+        return self._around
 
     def __setattr__(self, name: str, value: Any) -> None:
         name = PAPER_NAMES.get(name, name)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.circuits.names import without_medium
-from torchfilm.effect import BUILT_IN, Effect
+from torchfilm.effect import BUILT_IN, Effect, is_own
 from torchfilm.founders import Draw, one_draw
 from torchfilm.initial_cells import Cells
 from torchfilm.model import Model, bind
@@ -342,10 +342,15 @@ def _lacking_hint(effect: Effect, name: str, declared: Collection[str]) -> str:
 def _kept_twice(effect: Effect, value: str, field: str, other: str) -> str:
     """What is wrong where a value drawn at birth would be kept in another one's field."""
     if other == effect.title:
+        hint = (
+            "Give each a title of its own: make title a field or a property of"
+            f" {type(effect).__name__}."
+            if is_own(effect)
+            else "Let only one of them draw it; a rule may draw a variable for the other."
+        )
         return (
             f"{effect.title} is listed twice, and both draw their {value} for each cell, kept in"
-            f" the one field {field!r}. Give each a title of its own: make title a field or a"
-            f" property of {type(effect).__name__}."
+            f" the one field {field!r}. {hint}"
         )
     return (
         f"the {value} of {effect.title}, drawn for each cell, is kept in the field {field!r}, which"

@@ -145,6 +145,39 @@ def test_a_level_that_is_no_number_is_a_failure():
             pass
 
 
+def test_what_is_no_number_is_named_by_each():
+    def lose(cells):
+        cells.a = torch.where(cells.colony == 0, math.nan, cells.a)
+        cells.b = torch.where(cells.colony == 1, math.nan, cells.b)
+
+    scene = tf.Scene(
+        tf.Rules(lose, variables={"a": 0.0, "b": 0.0}), tf.Lysis("a"), tf.Lysis("b"),
+        founders=FOUR, dim=2,
+    )  # fmt: skip
+    with pytest.raises(tf.SimulationError, match=r"(?s)colony 0 .*: a, which.*colony 1 .*: b, wh"):
+        list(tf.simulate(scene, until=0.2, colonies=2))
+
+
+def test_many_species_are_summed_alike_in_any_batch():
+    names = tuple("abcdefgh")
+    scene = tf.Scene(
+        tf.Circuit(
+            lambda u, s, p, cell: {n: 0.0 * u[n] for n in names}, species=names,
+            initial={n: tf.Uniform(0.0, 1.0) for n in names},
+        ),
+        tf.Lysis(rate=1e9, releases={"all": names}), medium("all"), founders=FOUR,
+    )  # fmt: skip
+    five = step(scene, scene.bind(5).start(), 0.1)
+    one = step(scene, scene.bind(streams=[3]).start(), 0.1)
+    assert torch.equal(five.select([3]).signals["all"], one.signals["all"])
+
+
+def test_the_report_has_every_signal_in_every_step():
+    scene = tf.Scene(tf.Lysis(rate=0.0, releases={"a": 1.0}), medium("a"), founders=FOUR)
+    report = step(scene, scene.bind(2).start(), 0.1).reports["lysis"]
+    assert report.burst.tolist() == [0, 0] and report.released["a"].tolist() == [0.0, 0.0]
+
+
 def test_who_bursts_does_not_depend_on_the_batch(tmp_path):
     scene = tf.Scene(
         tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2), holding(leaks),
@@ -309,6 +342,8 @@ def test_a_search_grows_each_design_anew():
         ({}, "neither `when` nor `rate`"),
         ({"rate": 1.0, "above": 3.0}, "Lysis.above = 3.0 is not allowed: it must be given with"),
         ({"when": "a", "releases": {"a": ("b", "b")}}, "a tuple of different names"),
+        ({"when": "radius"}, "Lysis.when = 'radius' .*of a cell's shape"),
+        ({"when": "a", "releases": {"a": "length"}}, "of a cell's shape, `when` knows length"),
         ({"when": "a b"}, "Lysis.when = 'a b' is not allowed: it must be the name of a species"),
         ({"rate": -1.0}, "Lysis.rate"),
         ({"when": "toxin", "releases": ["toxin"]}, "a dict of what goes to each signal"),

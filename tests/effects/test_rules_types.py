@@ -242,7 +242,10 @@ def test_plasmids_go_to_one_daughter_or_the_other():
     [
         (lambda c: c.chance(1.5), "the probability 1.5: it must be between 0 and 1"),
         (lambda c: c.chance(float("nan")), "the probability nan"),
-        (lambda c: c.poisson(-1.0), "poisson was given the mean -1: it must be 0 or more"),
+        (
+            lambda c: c.poisson(-1.0),
+            "poisson was given the mean -1: it must be finite, and 0 or more",
+        ),
         (lambda c: c.poisson(float("inf")), "poisson was given the mean inf"),
         (lambda c: c.binomial(2.5, 0.5), "the number 2.5: it must be whole, 0 or more"),
         (lambda c: c.binomial(3, torch.ones(7)), r"shape \(7,\): it must be one value, or \(1,\)"),

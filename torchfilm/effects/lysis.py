@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,34 +17,42 @@ from torchfilm.signals.schedule import warn_of_steps
 from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.random import fine_uniform
+from torchfilm.tools.read_only import read_only
 from torchfilm.values import CONCENTRATION, Rule, Value, checked, physical
 
 AMOUNT = Rule("conc·µm³", least=0.0, scheduled=True)
 LENGTH, VOLUME = "length", "volume"
+_NO_LEVELS = ("radius", "position", "axis", "area", "cells")
+_OF_SHAPE = (
+    "a species or a variable; of a cell's shape, `when` knows length and volume, `releases` volume"
+)
 
 
 @dataclass(frozen=True)
 class LysisReport:
     """`burst` (B,): how many cells burst in this step. `released`: what they gave to each signal,
-    (B,) conc·µm³ by its name. `status` (B,): 1 where `when` is not a number in a cell."""
+    (B,) float64 conc·µm³ by its name. `unknown`: by each `when`, (B,), 1 where it is not a number
+    in a cell. `status` (B,): 1 where one of them is not."""
 
-    status: Tensor
     burst: Tensor
     released: Mapping[str, Tensor]
-    when: str | None
+    unknown: tuple[tuple[str | None, Tensor], ...]
     hint = "Let the rule, or the circuit, give it a number in every cell"
 
+    @property
+    def status(self) -> Tensor:
+        return functools.reduce(torch.maximum, (status for _, status in self.unknown))
+
     def reason(self, place: int) -> str:
-        return f"{self.when}, which decides which cells burst, is not a number in a cell"
+        when = next(name for name, status in self.unknown if status[place])
+        return f"{when}, which decides which cells burst, is not a number in a cell"
 
     def after(self, earlier: LysisReport) -> LysisReport:
         """With what another Lysis did earlier in the same step."""
         both = dict(earlier.released)
         for name, amount in self.released.items():
             both[name] = both[name] + amount if name in both else amount
-        status = torch.maximum(earlier.status, self.status)
-        when = self.when if bool(self.status.any()) else earlier.when
-        return LysisReport(status, earlier.burst + self.burst, both, when)
+        return LysisReport(earlier.burst + self.burst, both, earlier.unknown + self.unknown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +106,10 @@ class Lysis(Effect):
                 "Lysis.releases", self.releases,
                 'a dict of what goes to each signal, such as {"colicin": "colicin"}',
             )  # fmt: skip
-        kept = {s: self._checked_release(s, what) for s, what in (self.releases or {}).items()}
-        object.__setattr__(self, "releases", kept)
+        if self.when in _NO_LEVELS:
+            raise checks.input_error("Lysis.when", self.when, _OF_SHAPE)
+        given = {s: self._checked_release(s, what) for s, what in (self.releases or {}).items()}
+        object.__setattr__(self, "releases", read_only({s: given[s] for s in sorted(given)}))
 
     def _checked_release(self, signal: object, what: Any) -> Any:
         """A tuple of names, or a checked amount."""
@@ -107,6 +118,8 @@ class Lysis(Effect):
             raise checks.input_error("Lysis.releases", signal, "keys that name signals")
         names = tuple(what) if isinstance(what, tuple | list) else (what,)
         if names and all(map(_is_name, names)):
+            if {LENGTH, *_NO_LEVELS} & {*names}:
+                raise checks.input_error(path, what, _OF_SHAPE)
             if len(set(names)) < len(names):
                 raise checks.input_error(path, what, "a tuple of different names")
             return names
@@ -205,12 +218,15 @@ class BoundLysis(BoundEffect):
     def step(self, state: State, dt: float) -> State:
         """The state without the cells that burst, and with what they released."""
         effect, (bursts, unknown) = self.effect, self._bursts(state, dt)
-        released: dict[str, Tensor] = {}
+        assert effect.releases is not None
+        none = torch.zeros(state.colonies, dtype=torch.float64, device=state.device)
+        burst, released = none.long(), dict.fromkeys(effect.releases, none)
         gone = bool(bursts.any())
+        if gone:
+            burst = state.groups.sum(bursts.double()).long()
         if gone and effect.releases:
             state, released = self._released(state, bursts)
-        burst = state.groups.sum(bursts.double()).long() if gone else torch.zeros_like(unknown)
-        report = LysisReport(unknown, burst, released, effect.when)
+        report = LysisReport(burst, released, ((effect.when, unknown),))
         earlier = state.reports.get(effect.title)
         if self.number and isinstance(earlier, LysisReport):
             report = report.after(earlier)
@@ -263,7 +279,7 @@ class BoundLysis(BoundEffect):
         held = [
             _quantity(state, n) * (state.volume if _is_species(state, n) else 1.0) for n in what
         ]
-        return torch.stack(held).sum(0)
+        return functools.reduce(torch.add, held)  # in this order, whatever the batch
 
 
 def _quantity(state: State, name: str) -> Tensor:

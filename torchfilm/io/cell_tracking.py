@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from torchfilm.io.lineage import Lineage
 
 IMAGES, TRUTH, CELLS = "01", "01_GT", "cells.csv"
+FILES = (
+    r"01/t\d+\.tif|01_GT/(SEG/man_seg|TRA/man_track)\d+\.tif|01_GT/TRA/man_track\.txt|cells\.csv"
+)
 MOST_LABELS = np.iinfo(np.uint16).max
 DIGITS = 3  # of a frame's number in the names of files; more where there are more frames
 PLAIN = Camera(blur=0.0, background=0.0, offset=100.0, noise=None, seed=0)
@@ -114,7 +117,7 @@ def write_ctc(
     overwrite: bool,
 ) -> Path:
     """As `Results.to_ctc`."""
-    target = check_new_folder(path, (IMAGES, TRUTH, CELLS), overwrite)
+    target = check_new_folder(path, (IMAGES, TRUTH, CELLS), FILES, overwrite)
     checks.choice("profile", profile, PROFILES)
     images = _images(view, channels, profile, camera)
     tracks, number = Tracks(view.tables.lineage, view.colony), _numbers(len(view.frames))

@@ -4,6 +4,7 @@ there whole."""
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -54,11 +55,11 @@ def written_whole(path: Path) -> Iterator[Path]:
         beside.unlink(missing_ok=True)
 
 
-def check_new_folder(path: str | Path, parts: tuple[str, ...], overwrite: bool) -> Path:
+def check_new_folder(path: str | Path, parts: tuple[str, ...], files: str, overwrite: bool) -> Path:
     """The path of a folder to be made, with `parts` in it, of which the last says that it is such a
-    folder. Raises InputError for a path without a name or in a folder that does not exist, for a
-    file, and for a folder that holds anything; with `overwrite`, for one that holds other things
-    than such parts."""
+    folder. files: a pattern of the names of its files, from there. Raises InputError for a path
+    without a name or in a folder that does not exist, for a file, and for a folder that holds
+    anything; with `overwrite`, for one that holds other things than such files."""
     found = Path(path)
     if found.name in ("", ".."):
         raise checks.input_error("path", str(path), "the name of a folder, such as 'ctc'")
@@ -72,9 +73,15 @@ def check_new_folder(path: str | Path, parts: tuple[str, ...], overwrite: bool) 
         rule = "a path where there is nothing yet, or an empty folder"
         hint = "Choose another, or replace it: overwrite=True, or --overwrite."
         raise checks.input_error("path", str(path), rule, hint)
-    if held and (parts[-1] not in held or not {*held} <= {*parts}):
+    foreign = [name for name in held if name not in parts]
+    if held and not foreign and parts[-1] in held:
+        inside = (p.relative_to(found).as_posix() for p in sorted(found.rglob("*")) if p.is_file())
+        foreign = [name for name in inside if not re.fullmatch(files, name)]
+    elif held:
+        foreign = held
+    if foreign:
         rule = f"a folder that holds {', '.join(parts)} and nothing else, where it is replaced"
-        raise checks.input_error("path", str(path), rule, f"It holds {', '.join(held[:5])}.")
+        raise checks.input_error("path", str(path), rule, f"It holds {', '.join(foreign[:5])}.")
     return found
 
 

@@ -91,7 +91,7 @@ def cell_table(state: State, *, internals: bool = False) -> dict[str, np.ndarray
     """
     if not isinstance(state, State):
         raise checks.input_error("cell_table(state)", state, "a tf.State")
-    on_cpu = lambda x: x.detach().cpu().numpy()
+    on_cpu = lambda x: x.detach().cpu().numpy().copy()  # a table may be changed, a state not
     found = {"uid": state.uid, "colony": state.own_colony_id, "parent": state.parent}
     found |= {n: getattr(state, n) for n in ("position", "axis", "length", "radius")}
     for name, value in state.fields.items():

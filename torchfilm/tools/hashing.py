@@ -31,11 +31,12 @@ def digest(*things: Any) -> str:
     digests.
     """
     hasher = hashlib.sha256()
-    _add(hasher, things, set())
+    _add(hasher, things, set(), {})
     return hasher.hexdigest()[:16]
 
 
-def _add(hasher: Any, thing: Any, enclosing: set[int]) -> None:
+def _add(hasher: Any, thing: Any, enclosing: set[int], met: dict[int, int]) -> None:
+    """met: the numbers of the objects of users' classes that were met before, by their ids."""
     if isinstance(thing, torch.Tensor):
         thing = thing.detach().cpu().numpy()
     if isinstance(thing, np.ndarray):
@@ -52,11 +53,16 @@ def _add(hasher: Any, thing: Any, enclosing: set[int]) -> None:
     if id(thing) in enclosing:  # an object that contains itself, such as a recursive function
         hasher.update(b"again;")
         return
+    if _is_plain_object(thing):  # objects that refer to one another have many ways to each
+        if id(thing) in met:
+            hasher.update(f"object {met[id(thing)]} again;".encode())
+            return
+        met[id(thing)] = len(met)
     enclosing = enclosing | {id(thing)}
     # a list may have been a tuple before it was written to a file
     hasher.update(f"{'list' if isinstance(thing, tuple) else type(thing).__name__}(".encode())
     for part in _parts(thing):
-        _add(hasher, part, enclosing)
+        _add(hasher, part, enclosing, met)
     hasher.update(b")")
 
 
@@ -113,6 +119,16 @@ def _parts(thing: Any) -> list[Any]:
         *given,
         *(f for c in own for f in vars(c).values() if isinstance(f, FunctionType)),
     ]
+
+
+def _is_plain_object(thing: Any) -> bool:
+    """Whether it is an object of a class of a user's, but no dataclass."""
+    kind = type(thing)
+    return not (
+        isinstance(thing, (FunctionType, MethodType, CodeType, partial, type, Mapping, tuple, list))
+        or dataclasses.is_dataclass(thing)
+        or kind.__module__.split(".")[0] in OURS
+    )
 
 
 def _slots(thing: Any) -> dict[str, Any]:
