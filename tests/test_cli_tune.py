@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 
 import pytest
-from commands import shell
 
 import torchfilm as tf
 
@@ -27,16 +26,19 @@ def folder(tmp_path):
     return tmp_path
 
 
-def done(folder, *arguments) -> str:
+@pytest.fixture
+def done(command, capsys):
     """What a command that must work prints."""
-    ran = shell(*arguments, folder=folder)
-    assert ran.returncode == 0, ran.stderr
-    return ran.stdout
+
+    def call(*arguments) -> str:
+        command(*arguments)
+        return capsys.readouterr().out
+
+    return call
 
 
-def test_tune_prints_what_it_chose_and_writes_it_for_a_run(folder):
+def test_tune_prints_what_it_chose_and_writes_it_for_a_run(folder, done):
     out = done(
-        folder,
         "tune",
         "mine.py",
         "--error",
@@ -54,46 +56,23 @@ def test_tune_prints_what_it_chose_and_writes_it_for_a_run(folder):
     assert "picture   cost.png" in out and (folder / "cost.png").stat().st_size > 0
     saved = tf.Settings.load(folder / "s.json")
     assert f"dt={saved.dt:g}" in out and f"rtol={saved.rtol:g}" in out
-    done(
-        folder,
-        "run",
-        "mine.py",
-        "--settings",
-        "s.json",
-        "--cells",
-        "4",
-        "--out",
-        "a.h5",
-        "--no-picture",
-    )
+    done("run", "mine.py", "--settings", "s.json", "--cells", "4", "--out", "a.h5", "--no-picture")
     with tf.Results(folder / "a.h5") as results:
         assert results.accuracy == saved.given and results.attributes["dt"] == saved.dt
-    done(folder, "resume", "a.h5", "--scene", "mine.py", "--cells", "8", "--no-picture")
+    done("resume", "a.h5", "--scene", "mine.py", "--cells", "8", "--no-picture")
     with tf.Results(folder / "a.h5") as results:
         assert results.counts[-1].min() >= 8
 
 
-def test_a_run_by_a_preset_says_so_in_its_results(folder):
-    done(
-        folder,
-        "run",
-        "mine.py",
-        "--preset",
-        "draft",
-        "--cells",
-        "2",
-        "--out",
-        "a.h5",
-        "--no-picture",
-    )
+def test_a_run_by_a_preset_says_so_in_its_results(folder, done):
+    done("run", "mine.py", "--preset", "draft", "--cells", "2", "--out", "a.h5", "--no-picture")
     with tf.Results(folder / "a.h5") as results:
         assert results.attributes["dt"] == pytest.approx(0.08) and results.accuracy["rtol"] == 0.01
 
 
-def test_explain_says_what_a_preset_would_do(folder):
+def test_explain_says_what_a_preset_would_do(folder, done):
     words = [
-        done(folder, "explain", "mine.py", "--seconds", "0", *more)
-        for more in ((), ("--preset", "draft"))
+        done("explain", "mine.py", "--seconds", "0", *more) for more in ((), ("--preset", "draft"))
     ]
     assert "0.05 h" in words[0] and "0.08 h" in words[1]
 
@@ -125,9 +104,10 @@ def test_explain_says_what_a_preset_would_do(folder):
         (("run", "mine.py", "--settings", "empty.json", "--cells", "2"), "no settings of accuracy"),
     ],
 )
-def test_what_makes_no_sense_is_refused_before_anything_runs(folder, arguments, words):
+def test_what_makes_no_sense_is_refused_before_anything_runs(folder, command, arguments, words):
     (folder / "empty.json").write_text(json.dumps({}))
     (folder / "old.png").write_text("")
-    ran = shell(*arguments, folder=folder)
-    assert ran.returncode == 1 and words in ran.stderr and "Traceback" not in ran.stderr
+    with pytest.raises(SystemExit) as caught:  # no traceback
+        command(*arguments)
+    assert isinstance(caught.value.code, str) and words in caught.value.code
     assert not list(folder.glob("*.h5"))
