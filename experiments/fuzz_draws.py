@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 from unittest.mock import patch
 
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import seed as seeded
 from hypothesis import strategies as st
 from hypothesis.internal.conjecture.engine import ConjectureRunner
@@ -158,13 +158,18 @@ class Draw:
 
 
 def for_each(
-    draws: st.SearchStrategy[Any], count: int, seed: int, check: Callable[[Any], object]
+    draws: st.SearchStrategy[Any],
+    count: int,
+    seed: int,
+    check: Callable[[Any], object],
+    phases: Sequence[Phase] = tuple(Phase),
 ) -> None:
     """Calls check(draw) for `count` draws, each by itself, and reduces the first that it raises
-    for."""
+    for, if that is among the phases."""
     given_draws = given(draws)(lambda draw: check(draw))
     every = settings(
         max_examples=count,
+        phases=phases,
         deadline=None,
         database=None,
         suppress_health_check=list(HealthCheck),

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import sys
+from pathlib import Path
 
 import pytest
 import torch
 from helpers import array
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import Phase
 from hypothesis import strategies as st
 from traced import alone, by, circuits, close, ends, equal, one_step, plain_module
 
@@ -25,6 +27,9 @@ from torchfilm.circuits.rosenbrock import SAFETY, rodas3
 from torchfilm.kernels import compiling
 from torchfilm.kernels.compiling import for_python
 from torchfilm.tools.deterministic_math import deterministic_functions
+
+sys.path.append(str(Path(__file__).parents[2] / "experiments"))
+from fuzz_draws import for_each
 
 F32, F64 = torch.float32, torch.float64
 
@@ -385,10 +390,16 @@ def test_a_text_says_all_that_it_depends_on(monkeypatch):
 # --- circuits at random ---------------------------------------------------------------------------
 
 
-@given(circuits(), st.sampled_from([F32, F64]))
-@settings(max_examples=60, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate],
-          suppress_health_check=list(HealthCheck))  # fmt: skip
-def test_circuits_at_random(plain, made, dtype):
+DRAWN = st.tuples(circuits(), st.sampled_from([F32, F64]))
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5, 6])
+def test_circuits_at_random(plain, seed):
+    """Fifteen of each seed."""
+    for_each(DRAWN, 15, seed, lambda drawn: same_by_all(*drawn), phases=[Phase.generate])
+
+
+def same_by_all(made: dict, dtype: torch.dtype) -> None:
     """Compiled text and torch: the same bits. Functions and reactions: the same to the solver's
     tolerance, which is what their different rounding is allowed."""
     x0 = tf.Signal(diffusion=5.0, initial=0.3)
