@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import subprocess
 import sys
 from pathlib import Path
-
-import pytest
 
 MODULE = """
 from torchfilm.kernels.compiling import kernel
@@ -104,23 +103,22 @@ def test_a_file_system_without_locks_is_none_the_worse(tmp_path: Path):
     assert (out.returncode, out.stdout, out.stderr) == (0, "4.0\n", "")
 
 
-@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
-@pytest.mark.parametrize("size", [0, 100])
-def test_a_file_that_a_crash_cut_off_is_compiled_again(tmp_path: Path, suffix: str, size: int):
-    """Functions and callbacks: without a word, and once."""
+def test_a_file_that_a_crash_cut_off_is_compiled_again(tmp_path: Path):
+    """Functions and callbacks: without a word, and once. Then all is whole again."""
     (tmp_path / "summing.py").write_text(MODULE + CALLBACK)
     text = "import numpy as np\nfrom summing import total\nprint(total(np.ones(4)))"
     text += "\nprint(len(total.stats.cache_hits))"
     command = [sys.executable, "-c", text]
     run = lambda: subprocess.run(command, env=settings(tmp_path), capture_output=True, text=True)
     assert run().stdout == "4.0\n0\n" and run().stdout == "4.0\n1\n"
-    files = list(tmp_path.rglob(f"*.{suffix}"))
-    assert len(files) == 2
-    for file in files:
-        file.write_bytes(file.read_bytes()[:size])
-    outs = run(), run()
-    found = [(x.returncode, x.stdout, x.stderr) for x in outs]
-    assert found == [(0, f"4.0\n{n}\n", "") for n in (0, 1)]
+    for suffix, size in itertools.product(("nbi", "nbc"), (0, 100)):
+        files = list(tmp_path.rglob(f"*.{suffix}"))
+        assert len(files) == 2
+        for file in files:
+            file.write_bytes(file.read_bytes()[:size])
+        outs = run(), run()
+        found = [(x.returncode, x.stdout, x.stderr) for x in outs]
+        assert found == [(0, f"4.0\n{n}\n", "") for n in (0, 1)], (suffix, size)
 
 
 def test_a_full_disk_costs_only_what_is_kept(tmp_path: Path):
