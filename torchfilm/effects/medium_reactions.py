@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.circuits import failures, run
-from torchfilm.circuits.columns import Columns, Lookup
+from torchfilm.circuits.columns import Columns, Lookup, column
 from torchfilm.circuits.compiled_stiff import CompiledStiff, compiled_stiff
 from torchfilm.circuits.graph import check_returned
 from torchfilm.circuits.names import Names, UnknownName, label_of, unknown
@@ -188,44 +188,68 @@ class BoundReactions(BoundEffect):
                 raise checks.InputError(unknown(what, name, list(self.effect.parameters)))
 
     def _try(self, rates: Rates, signals: Sequence[str], state: State) -> None:
-        """Call the function on some voxels: with the concentrations at first, and others."""
+        """Call the function on some voxels: with the concentrations at first, with others, and with
+        those of one voxel alone."""
         rows = torch.arange(min(TRIED, self._nodes(state)), device=state.device)
-        seen: set[str] = set()
         read: set[str] = set()
-        found: Mapping[str, Tensor] = {}
+        seen: set[str] = set()
+        first = {n: state.fields[OUTSIDE + n].index_select(0, rows) for n in signals}
         more = 10.0 ** torch.linspace(-1.0, 1.0, rows.numel(), dtype=state.dtype).to(rows.device)
-        for shift in (0.0 * more, more):
-            columns = {n: state.fields[OUTSIDE + n].index_select(0, rows) + shift for n in signals}
-            every = torch.arange(rows.numel(), device=state.device)
-            s = Columns(columns, every, "s", read)
-            p = Columns(self._constants(state), rows, "p", seen)
-            try:
-                found = rates(s, p)
-            except UnknownName as error:
-                raise UnknownName(f"{self.label}: {error}") from error
-            except (TypeError, ValueError, RuntimeError, IndexError) as error:
-                raise checks.InputError(
-                    f"{self.label} failed on the columns of {rows.numel()} voxels: {error}. It is"
-                    " called with (s, p), each name a column with one value a voxel: use torch.exp"
-                    " and the like rather than math or numpy, torch.where rather than if."
-                ) from error
-            self._check(found, signals, rows.numel())
-        self.read = tuple(n for n in signals if n in read)
-        self.written = tuple(n for n in signals if n in found)
-        self._known = seen
-        self.part = lambda u, s, p, cell: rates(u, p)
+        others = {n: (k + 1.0) * more + x for k, (n, x) in enumerate(first.items())}
 
-    def _check(self, found: Any, signals: Sequence[str], count: int) -> None:
-        check_returned(found, self.label)
-        for name, value in found.items():
+        def called(columns: Mapping[str, Tensor], rows: Tensor) -> Mapping[str, Tensor]:
+            every = torch.arange(rows.numel(), device=rows.device)
+            s = Columns(columns, every, "s", read)
+            return self._called(rates, s, Columns(self._constants(state), rows, "p", seen), rows)
+
+        found = called(first, rows), called(others, rows)
+        for name in found[0]:
             if name not in signals:
                 wrong = f"{self.label} returned a rate for {name!r}, which is no signal"
                 raise checks.InputError(unknown(wrong, str(name), list(signals)))
-            if not bool(torch.isfinite(torch.as_tensor(value).detach()).all()):
+        alone = called({n: x[-1:] for n, x in others.items()}, rows[-1:])
+        for name, value in alone.items():
+            if not torch.allclose(found[1][name][-1:], value, rtol=1e-4, equal_nan=True):
+                raise checks.InputError(
+                    f"{self.label}: the rate of {name!r} in one voxel depends on what other voxels"
+                    " there are (a sum or a mean over them, or a draw?)."
+                )
+        if not alone:
+            raise checks.InputError(f"{self.label} returned no rate: it changes no signal.")
+        self.read = tuple(n for n in signals if n in read)
+        self.written = tuple(n for n in signals if n in found[0])
+        self._known = seen
+        self.part = lambda u, s, p, cell: rates(u, p)
+
+    def _called(self, rates: Rates, s: Columns, p: Columns, rows: Tensor) -> dict[str, Tensor]:
+        """The rates in some voxels, (M,) each."""
+        try:
+            found = rates(s, p)
+        except UnknownName as error:
+            raise UnknownName(f"{self.label}: {error}") from error
+        except (TypeError, ValueError, RuntimeError, IndexError) as error:
+            raise checks.InputError(
+                f"{self.label} failed on the columns of {rows.numel()} voxels: {error}. It is"
+                " called with (s, p), each name a column with one value a voxel: use torch.exp and"
+                " the like rather than math or numpy, torch.where rather than if."
+            ) from error
+        check_returned(found, self.label)
+        out = {}
+        for name, value in found.items():
+            made = column(value, rows.numel(), torch.empty(0, device=rows.device).double())
+            if made is None:
+                shape = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+                raise checks.InputError(
+                    f"{self.label} returned a rate of shape {shape} for {name!r}: it must be one"
+                    f" number a voxel, ({rows.numel()},)."
+                )
+            if not bool(torch.isfinite(made.detach()).all()):
                 raise checks.InputError(
                     f"{self.label} gives a rate of {name!r} that is not a finite number, at the"
-                    " first concentrations or 0.1 to 10 above them."
+                    " first concentrations or up to some tens above them."
                 )
+            out[name] = made
+        return out
 
     def _nodes(self, state: State) -> int:
         assert state.layout is not None
