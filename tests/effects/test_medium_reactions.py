@@ -90,6 +90,33 @@ def test_the_error_of_taking_turns_with_diffusion_is_of_second_order():
     assert 3.3 < errors[0] / errors[1] < 5.0 and 3.3 < errors[1] / errors[2] < 5.0
 
 
+def quiet(u, s, p, cell):
+    return {"maker": 0.0 * u.maker}, {"b": 0.1 * cell.volume}
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"exchange": "turns", "splitting": "strang", "steps": 1},
+                {"exchange": "turns", "steps": 4}],
+)  # fmt: skip
+def test_it_is_of_second_order_beside_circuits_that_exchange(options):
+    """Of the signals that react, one is exchanged, and one is not."""
+
+    def run(dt):
+        signals = {"a": tf.Signal(30.0, initial=in_the_middle), "b": tf.Signal(5.0, initial=0.5)}
+        scene = tf.Scene(
+            tf.Circuit(quiet, species="maker", rtol=1e-8),
+            tf.MediumReactions(
+                [tf.Reaction.of("2 a + b -> 3 a", rate=4.0)], rtol=1e-10, atol=1e-12
+            ),
+            tf.Medium(**signals, **BOX, **options), founders=FOUR, dt=dt,
+        )  # fmt: skip
+        return later(scene, 1.6).signals["a"]
+
+    exact = run(0.0125)
+    errors = [float((run(dt) - exact).abs().max()) for dt in (0.2, 0.1, 0.05)]
+    assert 3.3 < errors[0] / errors[1] < 5.0 and 3.3 < errors[1] / errors[2] < 5.0
+
+
 def test_a_front_has_the_speed_of_fisher():
     """∂s/∂t = D ∂²s/∂x² + r s(1 − s): from a step the front comes to 2√(rD) − 1.5 √(D/r)/t."""
     r, diffusion, width = 2.0, 50.0, 400.0
@@ -192,7 +219,7 @@ def test_what_runs_away_fails_and_names_its_colony():
         tf.MediumReactions(lambda s, p: {"a": p.k * s.a**2}, parameters={"k": [0.1, 50.0]}),
         medium(a=1.0), dim=2,
     )  # fmt: skip
-    with pytest.raises(tf.SimulationError, match=r"colony 1 .*in the medium: .*'a' runs away"):
+    with pytest.raises(tf.SimulationError, match=r"colony 1 .*in the medium, at \(.*'a' runs"):
         later(scene, 1.0, colonies=2)
 
 
@@ -200,6 +227,11 @@ def test_what_runs_away_fails_and_names_its_colony():
     ("make", "words"),
     [
         (lambda: tf.MediumReactions(3), "a function f\\(s, p\\), or a list of reactions"),
+        (lambda: tf.MediumReactions(["a -> b"]), r"'a -> b' is not .*a list of tf\.Reaction"),
+        (
+            lambda: tf.MediumReactions([tf.Reaction.of("a -> b", rate=lambda u, s, p, c: u.a)]),
+            "a number or the name of a parameter",
+        ),
         (lambda: tf.MediumReactions([]), "a function f\\(s, p\\), or a list of reactions"),
         (lambda: tf.MediumReactions(degrade, parameters=[1.0]), "a dict"),
         (lambda: tf.MediumReactions(degrade, parameters={"k": {0: 1.0}}), "one per colony"),
@@ -218,15 +250,19 @@ def test_bad_descriptions(make, words):
         (lambda s, p: {"drug": -s.enzyme}, "does not read k of MediumReactions.parameters"),
         (lambda s, p: {"drg": -p.k * s.drug}, "'drg', which is no signal.*Did you mean 'drug'"),
         (lambda s, p: {"drug": -p.k * s.drugs}, "s has no 'drugs'"),
-        (lambda s, p: {"drug": -p.j * s.drug}, "p has no 'j'"),
+        (lambda s, p: {"drug": -p.j * s.drug}, r"p \(MediumReactions.parameters\) has no 'j'"),
         (lambda s, p: -p.k * s.drug, "it must return a dict"),
         (lambda s, p: {}, "it changes no signal"),
+        (lambda s, p: {"drug": -p.k * s.drug} if float(s.drug[0]) == 3.0 else {}, "of others at"),
         (lambda s, p: {"drug": -p.k * s.drug.mean()}, "in one voxel depends on what other voxels"),
         (lambda s, p: {"drug": p.k * s.drug.outer(s.drug)}, r"shape \(16, 16\) for 'drug'"),
         (lambda s, p: {"drug": p.k * torch.log(s.drug - 3.0)}, "not a finite number"),
         (lambda s, p: {"drug": p.k * math.exp(s.drug)}, r"called with \(s, p\)"),
         ([tf.Reaction.of("drug -> ", rate="j")], "needs the parameter 'j'"),
-        ([tf.Reaction.of("drug -> drugs", rate="k")], "unknown name 'drugs'"),
+        (
+            [tf.Reaction.of("drug -> drugs", rate="k")],
+            "has 'drugs', which is no signal.*Did you mean 'drug'",
+        ),
     ],
 )
 def test_rates_that_do_not_fit(rates, words):
@@ -235,6 +271,51 @@ def test_rates_that_do_not_fit(rates, words):
     )
     with pytest.raises(tf.InputError, match=words):
         scene.bind()
+
+
+def test_what_fails_is_dropped_once():
+    scene = tf.Scene(
+        tf.MediumReactions(lambda s, p: {"a": p.k * s.a**2}, parameters={"k": [0.1, 50.0]}),
+        medium(a=1.0), dim=2,
+    )  # fmt: skip
+    with pytest.warns(RuntimeWarning, match="colony 1 .* failed in step 1 ") as seen:
+        last = later(scene, 0.2, colonies=2, on_failure="drop")
+    assert len(seen) == 1 and last.counts.tolist() == [1, 0]
+
+
+def test_a_rate_in_a_list_may_differ_by_colony():
+    reactions = [tf.Reaction.of("a -> ", rate=torch.tensor([1.0, 2.0]))]
+    scene = tf.Scene(tf.MediumReactions(reactions), medium(a=1.0), dim=2)
+    state = later(scene, 1.0, colonies=2)
+    found = state.signals["a"].view(2, -1)[:, 0].tolist()
+    assert found == pytest.approx([math.exp(-1.0), math.exp(-2.0)], rel=1e-4)
+    *_, both = tf.simulate(scene, state, until=1.5)
+    *_, alone = tf.simulate(scene, state.select([1]), until=1.5)
+    assert torch.equal(both.select([1]).signals["a"], alone.signals["a"])
+
+
+def test_a_signal_that_reactions_only_consume_is_warned_of():
+    with pytest.warns(UserWarning, match="'drug' of the Medium is 0 and stays 0"):
+        tf.Scene(
+            tf.MediumReactions([tf.Reaction.of("enzyme + drug -> enzyme", rate=1.0)]),
+            medium(enzyme=0.5, drug=0.0), dim=2,
+        ).bind()  # fmt: skip
+
+
+def test_obstacles_are_not_tried():
+    scene = tf.Scene(
+        tf.MediumReactions(lambda s, p: {"a": -s.a * s.b / s.b}),
+        tf.Medium(a=tf.Signal(1.0, initial=1.0), b=tf.Signal(1.0, initial=1.0),
+                  obstacles=lambda x: x[:, 0] < 0.0, **BOX), dim=2,
+        founders=tf.Cells([[5.0, 0.0]], [[1.0, 0.0]]),
+    )  # fmt: skip
+    assert float(later(scene, 1.0).signals["a"].max()) == pytest.approx(math.exp(-1.0), rel=1e-4)
+
+
+def test_settings_reach_it():
+    reactions = tf.MediumReactions(degrade, parameters={"k": 1.0})
+    assert reactions.with_settings(tf.Settings(rtol=1e-6)).rtol == 1e-6
+    assert reactions.accuracy_knobs() == {"rtol": 1e-4}
 
 
 def test_reactions_need_a_medium():

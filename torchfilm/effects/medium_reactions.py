@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,10 +18,13 @@ from torchfilm.circuits.names import Names, UnknownName, label_of, unknown
 from torchfilm.circuits.network import build_network
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.circuits.tracing import Untraceable
-from torchfilm.effect import AFTER_CELLS, BEFORE_NUTRITION, Binding, BoundEffect, Effect
+from torchfilm.effect import FIRST_REACTIONS, LAST_REACTIONS, Binding, BoundEffect, Effect
+from torchfilm.resolver import snapshot
 from torchfilm.signals.schedule import warn_of_steps
 from torchfilm.state import OUTSIDE, State
 from torchfilm.tools import checks
+from torchfilm.tools.backends import check_backend, why_torch
+from torchfilm.tools.read_only import read_only
 from torchfilm.tools.tangents import outside_checkpoints
 from torchfilm.values import COLONY, Rule, checked
 
@@ -55,8 +59,10 @@ class MediumReactions(Effect):
     parameters: constants by name, one number, one per colony, or a Schedule. rtol, atol: the error
     of a step is at most atol + rtol·|s| in each voxel. backend: as in Circuit.
 
-    A stiff solver takes half of each step before cells exchange signals and half after (Strang);
-    nothing goes below 0. Obstacles hold no signal, and nothing reacts there.
+    A stiff solver takes half of each step before transport and exchange and half after (Strang);
+    reactions make nothing negative. Obstacles hold no signal, and nothing reacts there. The rates
+    of reactions in a list are numbers, one per colony, or names of parameters. Where a voxel cannot
+    be stepped its colony fails; in a colony without cells it keeps its concentrations.
     """
 
     rates: Rates | Sequence[Reaction]
@@ -65,18 +71,15 @@ class MediumReactions(Effect):
     atol: float = 1e-9
     backend: str | None = None
 
-    stage = AFTER_CELLS
+    stage = LAST_REACTIONS
     title = "medium reactions"
     may_repeat = False
     instead_of_two = "Let one function, or one list, have all reactions."
     works_on_grid = True
 
     def __post_init__(self) -> None:
-        listed = isinstance(self.rates, Sequence) and not isinstance(self.rates, str)
-        if not (callable(self.rates) or (listed and self.rates)):
-            raise checks.input_error(
-                "MediumReactions.rates", self.rates, "a function f(s, p), or a list of reactions"
-            )
+        if not callable(self.rates):
+            object.__setattr__(self, "rates", _checked_list(self.rates))
         if not isinstance(self.parameters, Mapping):
             raise checks.input_error(
                 "MediumReactions.parameters", self.parameters, 'a dict, {"k": 2.0}'
@@ -86,16 +89,28 @@ class MediumReactions(Effect):
                 raise checks.input_error("MediumReactions.parameters", name, "a name, such as 'k'")
         checks.number("MediumReactions.rtol", self.rtol, above=0.0, most=0.1)
         checks.number("MediumReactions.atol", self.atol, above=0.0)
-        if self.backend not in (None, "compiled", "torch"):
-            raise checks.input_error(
-                "MediumReactions.backend", self.backend, 'None, "compiled" or "torch"'
-            )
-        values = {n: checked(self._path(n), v, CONSTANT) for n, v in self.parameters.items()}
-        object.__setattr__(self, "parameters", values)
+        check_backend("MediumReactions", self.backend)
+        values = {
+            n: checked(f"MediumReactions.{n}", v, CONSTANT) for n, v in self.parameters.items()
+        }
+        object.__setattr__(self, "parameters", read_only(values))
 
-    @staticmethod
-    def _path(name: str) -> str:
-        return f"MediumReactions.parameters[{name!r}]"
+    def only_takes(self) -> tuple[str, ...]:
+        """Of reactions in a list, the signals that none makes."""
+        if callable(self.rates):
+            return ()
+        changes = [r.change() for r in self.rates]
+        names = dict.fromkeys(n for change in changes for n in change)
+        return tuple(OUTSIDE + n for n in names if all(c.get(n, 0) <= 0 for c in changes))
+
+    def accuracy_knobs(self) -> Mapping[str, float]:
+        return {"rtol": self.rtol}
+
+    def accuracy_parameters(self) -> Mapping[str, str]:
+        return {"rtol": f"{self.rtol:g}"}
+
+    def with_settings(self, settings: Any) -> MediumReactions:
+        return self if settings.rtol is None else dataclasses.replace(self, rtol=settings.rtol)
 
     def physical_values(self) -> dict[str, tuple[Any, Rule]]:
         return {n: (v, CONSTANT) for n, v in self.parameters.items()}
@@ -105,8 +120,30 @@ class MediumReactions(Effect):
 
     def bind(self, binding: Binding) -> tuple[BoundEffect, ...]:
         before = BoundReactions(self, binding)
-        before.stage, before.title = BEFORE_NUTRITION, "medium reactions, first half"
+        before.stage, before.title = FIRST_REACTIONS, "medium reactions, first half"
         return before, BoundReactions(self, binding)
+
+
+def _checked_list(given: object) -> tuple[Reaction, ...]:
+    """The reactions of a list, or of lists of them."""
+    found: list[Reaction] = []
+    for entry in given if isinstance(given, list | tuple) else ():
+        if isinstance(entry, list | tuple):
+            found += _checked_list(entry)
+            continue
+        if not isinstance(entry, Reaction):
+            raise checks.input_error("MediumReactions.rates", entry, "a list of tf.Reaction")
+        if callable(entry.rate):
+            raise checks.input_error(
+                f"MediumReactions.rates: the rate of {str(entry)!r}", entry.rate,
+                "a number or the name of a parameter", "Other laws stand in a function f(s, p).",
+            )  # fmt: skip
+        found.append(entry)
+    if not found:
+        raise checks.input_error(
+            "MediumReactions.rates", given, "a function f(s, p), or a list of reactions"
+        )
+    return tuple(found)
 
 
 class BoundReactions(BoundEffect):
@@ -121,7 +158,8 @@ class BoundReactions(BoundEffect):
         self.written: tuple[str, ...] = ()
         self.part: Any = None
         self.compiled: CompiledStiff | None = None
-        self.by_torch = "" if effect.backend != "torch" else 'it was given backend="torch"'
+        self.by_torch = why_torch("MediumReactions", effect.backend, binding.batch.device)
+        self.rates = snapshot(effect.rates, "MediumReactions.rates", binding.batch)
 
     def reads(self) -> tuple[str, ...]:
         return tuple(OUTSIDE + n for n in self.species)
@@ -146,10 +184,10 @@ class BoundReactions(BoundEffect):
                 " tf.Medium(…, box=…, spacing=…)."
             )
         signals = tuple(state.signals)
-        if callable(self.effect.rates):
-            self._try(self.effect.rates, signals, state)
+        if callable(self.rates):
+            self._try(self.rates, signals, state)
         else:
-            self._listed(self.effect.rates, signals)
+            self._listed(self.rates, signals)
         if unread := [n for n in self.effect.parameters if n not in self._known]:
             raise checks.InputError(
                 f"{self.label} does not read {', '.join(unread)} of MediumReactions.parameters:"
@@ -168,18 +206,16 @@ class BoundReactions(BoundEffect):
                     ) from why
         return state
 
-    def _listed(self, reactions: Any, signals: Sequence[str]) -> None:
-        network = build_network(reactions, signals)
-        used = {
-            n
-            for r in network.reactions
-            for n in (*r.consumes, *r.produces, *getattr(r.rate, "reads", ()))
-        }
+    def _listed(self, reactions: Sequence[Reaction], signals: Sequence[str]) -> None:
+        used = {n for r in reactions for n in (*r.consumes, *r.produces)}
+        for name in sorted(used - {*signals}):
+            what = f"a reaction in the medium has {name!r}, which is no signal"
+            raise checks.InputError(unknown(what, name, list(signals)))
         self.read = tuple(n for n in signals if n in used)
-        network = build_network(reactions, self.read)
-        moved = network.stoichiometry.any(0).tolist()
-        self.written = tuple(n for n, moves in zip(self.read, moved, strict=True) if moves)
-        self.part, self._known = network, set(network.parameters)
+        changed = {n for r in reactions for n, change in r.change().items() if change}
+        self.written = tuple(n for n in signals if n in changed)
+        self.part = network = build_network(reactions, self.read)
+        self._known = set(network.parameters)
         for name in network.parameters:
             if name not in self.effect.parameters:
                 what = (
@@ -188,9 +224,13 @@ class BoundReactions(BoundEffect):
                 raise checks.InputError(unknown(what, name, list(self.effect.parameters)))
 
     def _try(self, rates: Rates, signals: Sequence[str], state: State) -> None:
-        """Call the function on some voxels: with the concentrations at first, with others, and with
-        those of one voxel alone."""
-        rows = torch.arange(min(TRIED, self._nodes(state)), device=state.device)
+        """Call the function on some voxels of the medium: with the concentrations at first, with
+        others, and with those of one voxel alone."""
+        assert state.layout is not None
+        mask = state.layout.mask
+        every = torch.arange(self._nodes(state), device=state.device)
+        inside = every if mask is None else torch.nonzero(mask).squeeze(1)
+        rows = inside[:: max(1, len(inside) // TRIED)][:TRIED]  # of all colonies
         read: set[str] = set()
         seen: set[str] = set()
         first = {n: state.fields[OUTSIDE + n].index_select(0, rows) for n in signals}
@@ -198,16 +238,27 @@ class BoundReactions(BoundEffect):
         others = {n: (k + 1.0) * more + x for k, (n, x) in enumerate(first.items())}
 
         def called(columns: Mapping[str, Tensor], rows: Tensor) -> Mapping[str, Tensor]:
-            every = torch.arange(rows.numel(), device=rows.device)
-            s = Columns(columns, every, "s", read)
-            return self._called(rates, s, Columns(self._constants(state), rows, "p", seen), rows)
+            among = torch.arange(rows.numel(), device=rows.device)
+            s = Columns(columns, among, "s", read)
+            p = Columns(self._constants(state), rows, "p (MediumReactions.parameters)", seen)
+            return self._called(rates, s, p, rows)
 
         found = called(first, rows), called(others, rows)
-        for name in found[0]:
+        for name, value in found[0].items():
             if name not in signals:
                 wrong = f"{self.label} returned a rate for {name!r}, which is no signal"
                 raise checks.InputError(unknown(wrong, str(name), list(signals)))
+            if not bool(torch.isfinite(value.detach()).all()):
+                raise checks.InputError(
+                    f"{self.label} gives a rate of {name!r} that is not a finite number, at the"
+                    " first concentrations."
+                )
         alone = called({n: x[-1:] for n, x in others.items()}, rows[-1:])
+        if not alone.keys() == found[0].keys() == found[1].keys():
+            raise checks.InputError(
+                f"{self.label} returns rates of {', '.join(found[0])} at first, and of others at"
+                " other concentrations: always return the same ones, 0 where nothing changes."
+            )
         for name, value in alone.items():
             if not torch.allclose(found[1][name][-1:], value, rtol=1e-4, equal_nan=True):
                 raise checks.InputError(
@@ -243,11 +294,6 @@ class BoundReactions(BoundEffect):
                     f"{self.label} returned a rate of shape {shape} for {name!r}: it must be one"
                     f" number a voxel, ({rows.numel()},)."
                 )
-            if not bool(torch.isfinite(made.detach()).all()):
-                raise checks.InputError(
-                    f"{self.label} gives a rate of {name!r} that is not a finite number, at the"
-                    " first concentrations or up to some tens above them."
-                )
             out[name] = made
         return out
 
@@ -271,18 +317,23 @@ class BoundReactions(BoundEffect):
         if rows is None:
             rows = torch.arange(self._nodes(state), device=state.device)
         assert state.layout is not None
-        volume = state.length.new_full((), state.layout.grid.voxel_volume)  # reactions may ask
+        grid = state.layout.grid
+        # what reactions in a list ask of their cell
+        cell = {
+            "volume": state.length.new_full((), grid.voxel_volume),
+            "colony": state.colony_id.index_select(0, grid.owner),
+        }
         return run.CircuitCells(
-            self.part, self.species, (), rows, {"volume": volume}, self._constants(state), {},
+            self.part, self.species, (), rows, cell, self._constants(state), {},
             label=self.label, compiled=self.compiled, by_torch=bool(self.by_torch),
         )  # fmt: skip
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        if self.stage != AFTER_CELLS:
+        if self.stage != LAST_REACTIONS:
             return [f"over {dt / 2:g} h, by the method that the second half lists"]
         e = self.effect
         return [
-            "half of the step before cells exchange signals, half after (Strang)",
+            "half of the step before transport and exchange, half after (Strang)",
             f"stiff solver (Rodas3), each voxel in steps of its own: error at most {e.atol:g} +"
             f" {e.rtol:g}·|s| in each; nothing below 0",
             f"computed by torch: {self.by_torch}"
@@ -298,15 +349,16 @@ class BoundReactions(BoundEffect):
             return state
         rows = None if layout.mask is None else torch.nonzero(layout.mask).squeeze(1)
         voxels = self._voxels(state, rows)
-        names = [OUTSIDE + n for n in self.species]
-        before = torch.stack([state.fields[n] for n in names], 1).index_select(0, voxels.rows)
+        before = torch.stack([state.fields[OUTSIDE + n] for n in self.species], 1)
+        before = before if rows is None else before.index_select(0, rows)
         settings = run.IntegrationSettings("rosenbrock", 1, self.effect.rtol, self.effect.atol, 1.0)
         made = run.step(voxels, before, 0.5 * dt, settings)
         changed = {}
         for k, name in enumerate(self.species):
             if name in self.written:
                 old = state.fields[OUTSIDE + name]
-                value = made.concentrations[:, k].to(old.dtype)
+                value = torch.where(made.failed, before[:, k], made.concentrations[:, k])
+                value = value.to(old.dtype).contiguous()
                 changed[OUTSIDE + name] = value if rows is None else old.index_copy(0, rows, value)
         report = self._report(state, voxels, made, before, 0.5 * dt)
         reports = {**state.reports, self.effect.title: report}
@@ -320,14 +372,17 @@ class BoundReactions(BoundEffect):
         words: dict[int, str] = {}
         status = torch.zeros_like(state.counts)
         earlier = state.reports.get(self.effect.title)
-        if self.stage == AFTER_CELLS and isinstance(earlier, MediumReactionsReport):
+        if self.stage == LAST_REACTIONS and isinstance(earlier, MediumReactionsReport):
             words, status = dict(earlier.words), earlier.status.clone()
         if bool(made.failed.any()):
             at = torch.nonzero(made.failed).squeeze(1)
             owner = state.layout.grid.owner.index_select(0, voxels.rows.index_select(0, at))
+            alive = (state.counts > 0).tolist()
             for k, place in zip(at.tolist(), owner.tolist(), strict=True):
-                if place not in words:
+                if place not in words and alive[place]:
                     said = failures.words(voxels, int(made.code[k]), before, k, "rosenbrock", dt)
-                    words[place] = f"{self.label} in the medium: {said}"
+                    where = state.layout.grid.centres()[int(voxels.rows[k])].tolist()
+                    at_place = ", ".join(f"{x:.4g}" for x in where)
+                    words[place] = f"{self.label} in the medium, at ({at_place}) µm: {said}"
                     status[place] = 1
         return MediumReactionsReport(status, words)
