@@ -56,6 +56,39 @@ def test_a_scene_runs_where_it_was_asked_to(pretended_cuda, name):  # noqa: F811
         assert torch.allclose(found.cpu().double(), right.double(), rtol=1e-6, atol=1e-9), n
 
 
+@torch.no_grad()
+def test_cells_burst_and_signals_react_where_they_are(pretended_cuda):  # noqa: F811
+    def draw(cells):
+        cells.mutations = cells.mutations + cells.poisson(0.5) + cells.normal().abs()
+        cells.near = cells.signals.b * 1.0
+
+    def run(device):
+        scene = tf.Scene(
+            tf.Rules(draw, variables={"mutations": 0.0, "near": 0.0}), tf.Growth(rate=1.0),
+            tf.Division(length=3.0), tf.Mechanics(dim=2, backend="torch", tolerance=1e-8),
+            tf.Circuit(lambda u, s, p, cell: {"m": 1.0 - u.m}, species="m"),
+            tf.Lysis(rate=3.0, releases={"a": ("m", "volume"), "b": 2.0}),
+            tf.MediumReactions(lambda s, p: {"b": -p.k * s.a * s.b}, parameters={"k": [1.0, 2.0]}),
+            tf.Medium(a=tf.Signal(50.0), b=tf.Signal(5.0, initial=0.1),
+                      box=[[-20.0, -20.0], [20.0, 20.0]], spacing=4.0, depth=1.0),
+            founders=tf.Cells([[1.5 * k - 9, 0.0] for k in range(12)], [[0.0, 1.0]] * 12),
+        )  # fmt: skip
+        state = scene.bind(2, device=device, dtype=torch.float64).start()
+        for _ in range(6):
+            state = step(scene, state, 0.05)
+        assert not tf.failures(state) and state.cells < 40
+        return state, tf.measure.pressure(state, scene, dt=0.05), tf.cell_table(state)
+
+    (there, press, table), (here, right, own) = run("cuda"), run("cpu")
+    assert press.device.type == "cuda" and there.reports["lysis"].burst.device.type == "cuda"
+    assert torch.allclose(press.cpu(), right, rtol=1e-4, atol=1e-6 * float(right.max()))
+    assert torch.equal(there.uid.cpu(), here.uid)
+    for name in own:
+        assert table[name] == pytest.approx(own[name], rel=1e-5, abs=1e-6), name
+    for name in here.signals:
+        assert torch.allclose(there.signals[name].cpu(), here.signals[name], rtol=1e-6), name
+
+
 def test_a_model_of_another_gpu_refuses_a_state(pretended_cuda):  # noqa: F811
     """All that is pretended to be on some GPU is on the first."""
     with pytest.raises(tf.InputError, match=r"on cuda:0' .*on cuda:1, as the model is"):
