@@ -303,7 +303,8 @@ def _check_place(quantities: Quantities, reaction: str) -> None:
     if not others:
         raise InputError(
             f"the reaction {reaction!r} happens outside of cells: leave it out,"
-            f" without=({reaction!r},), and describe it in the medium, such as tf.Signal(decay=…)"
+            f" without=({reaction!r},), and describe it in the medium, by tf.Signal(decay=…) or"
+            " tf.MediumReactions(…)"
         )
 
 
