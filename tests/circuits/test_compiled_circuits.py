@@ -41,6 +41,7 @@ READY = {
     "repressilator": {"noise": False},
     "random_partition": {},
     "quorum_sensing": {"size": 64.0, "k3": [0.5, 2.0]},
+    "synchronized_lysis": {"half": [0.1, 1e-3], "rate": 2.0},
     "boundary_detector": {},
 }
 
