@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -58,6 +58,10 @@ class Binding:
     declared: Mapping[str, str]
     division_stage: int
 
+    def reservoirs(self, signals: Iterable[str]) -> tuple[str, ...]:
+        """The fields of the reservoirs of these signals that there are."""
+        return tuple(n for s in signals if (n := f"{s}_reservoir") in self.declared)
+
 
 class Effect(metaclass=checks.KnownKeywords):
     """Base of all effects: a frozen dataclass with a `stage` and a `title`. Override `step`, and
@@ -77,10 +81,9 @@ class Effect(metaclass=checks.KnownKeywords):
     writes_anything: ClassVar[bool] = False
     # Kernels compute its steps on the CPU, with few operations of torch between them.
     by_kernels: ClassVar[bool] = False
-    # The first value that hints suggest for a variable that it needs.
-    usual_first: ClassVar[float] = 1.0
     # Its cost depends on the voxels of the grid, not on the cells.
     works_on_grid: ClassVar[bool] = False
+    usual_first: ClassVar[float] = 1.0  # what hints suggest for a variable that it needs
 
     def __init_subclass__(cls, **given: Any) -> None:
         """Have physical values checked before a `__post_init__` of the class's own, also where that

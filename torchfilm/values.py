@@ -95,6 +95,17 @@ def physical(default: Any = dataclasses.MISSING, **rule: Any) -> Any:
     return field(default=default, metadata={"physical": Rule(**rule)})
 
 
+def checked_constants(owner: str, given: object, rule: Rule) -> dict[str, Any]:
+    """The constants that a user's own functions read, by name, as an effect keeps them. owner: the
+    effect to whose `parameters` they were given. Raises InputError for what is no such dict."""
+    if not isinstance(given, Mapping):
+        raise checks.input_error(f"{owner}.parameters", given, 'a dict, {"k": 2.0}')
+    for name in given:
+        if not (isinstance(name, str) and name.isidentifier()):
+            raise checks.input_error(f"{owner}.parameters", name, "a name, such as 'k'")
+    return {n: checked(f"{owner}.{n}", v, rule) for n, v in given.items()}
+
+
 def checked(name: str, given: object, rule: Rule, forms: str = FORMS) -> Any:
     """A physical value as an effect keeps it: a float, a 1-D tensor, `ByType`, `PerColony` or a
     `Distribution`.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any
@@ -35,6 +35,13 @@ class Network:
     def names(self) -> tuple[str, ...]:
         """Columns of the stoichiometry: species, then signals as "out.name"."""
         return (*self.species, *(OUTSIDE + s for s in self.signals))
+
+    def check_parameters(self, owner: str, given: Collection[str]) -> None:
+        """Raise InputError where the effect `owner` was not given a parameter of a reaction."""
+        for name in self.parameters:
+            if name not in given:
+                what = f"a reaction needs the parameter {name!r}, which {owner} was not given"
+                raise checks.InputError(unknown(what, name, list(given)))
 
     def concentration_rates(self, u: Names, s: Names, p: Names, cell: Names) -> list[Tensor]:
         """R rates, each (n,) conc/h in the cell's volume; differentiable.

@@ -19,7 +19,7 @@ from torchfilm.circuits.compiled_step import Surroundings
 from torchfilm.circuits.compiled_stiff import compiled_stiff
 from torchfilm.circuits.dilution import Start, half_way, part_way
 from torchfilm.circuits.draws import KeyedDraws
-from torchfilm.circuits.names import label_of, unknown
+from torchfilm.circuits.names import label_of
 from torchfilm.circuits.network import build_network
 from torchfilm.circuits.tracing import Untraceable
 from torchfilm.circuits.trial import try_circuit
@@ -77,17 +77,12 @@ class BoundCircuit(BoundEffect):
     # --- binding -------------------------------------------------------------------------
 
     def reads(self) -> tuple[str, ...]:
-        reservoir = [
-            f"{n}_reservoir" for n in self.exchanges() if f"{n}_reservoir" in self.binding.declared
-        ]
+        reservoir = self.binding.reservoirs(self.exchanges())
         return tuple(dict.fromkeys((*super().reads(), *self.traced_reads, *reservoir)))
 
     def writes(self) -> tuple[str, ...]:
         written = [OUTSIDE + n for n in self.exchanges()]
-        reservoir = [
-            f"{n}_reservoir" for n in self.exchanges() if f"{n}_reservoir" in self.binding.declared
-        ]
-        return (*super().writes(), *written, *reservoir)
+        return (*super().writes(), *written, *self.binding.reservoirs(self.exchanges()))
 
     def typed_values(self) -> dict[str, tuple[int, ...]]:
         """First values serve the start only, and constants by type the rates of that type."""
@@ -115,11 +110,9 @@ class BoundCircuit(BoundEffect):
             for k, part in self.rates.items()
             if not callable(part)
         }
+        for made in self.networks.values():
+            made.check_parameters("Circuit", circuit.parameters)
         named = [n for made in self.networks.values() for n in made.parameters]
-        for name in named:
-            if name not in circuit.parameters:
-                what = f"a reaction needs the parameter {name!r}, which Circuit was not given"
-                raise checks.InputError(unknown(what, name, list(circuit.parameters)))
         seen: dict[str, set[str]] = {"s": set(), "cell": set(), "p": set(named)}
         contact = state.contact()
         found = {} if contact is None else contact.found

@@ -188,16 +188,11 @@ class BoundLysis(BoundEffect):
         alike = [e for e in effects if isinstance(e, BoundLysis)]
         self.number = alike.index(self)
 
-    def _reservoirs(self) -> tuple[str, ...]:
-        assert self.effect.releases is not None
-        names = (f"{signal}_reservoir" for signal in self.effect.releases)
-        return tuple(n for n in names if n in self.binding.declared)
-
     def reads(self) -> tuple[str, ...]:
-        return (*super().reads(), *self._reservoirs())
+        return (*super().reads(), *self.binding.reservoirs(self.effect.releases or ()))
 
     def writes(self) -> tuple[str, ...]:
-        return (*super().writes(), *self._reservoirs())
+        return (*super().writes(), *self.binding.reservoirs(self.effect.releases or ()))
 
     def numerics(self, dt: float, state: State) -> list[str]:
         effect = self.effect

@@ -26,7 +26,7 @@ from torchfilm.tools import checks
 from torchfilm.tools.backends import check_backend, why_torch
 from torchfilm.tools.read_only import read_only
 from torchfilm.tools.tangents import outside_checkpoints
-from torchfilm.values import COLONY, Rule, checked
+from torchfilm.values import COLONY, Rule, checked_constants
 
 CONSTANT = Rule(scope=COLONY, scheduled=True)
 TRIED = 16  # voxels, of a trial
@@ -80,19 +80,10 @@ class MediumReactions(Effect):
     def __post_init__(self) -> None:
         if not callable(self.rates):
             object.__setattr__(self, "rates", _checked_list(self.rates))
-        if not isinstance(self.parameters, Mapping):
-            raise checks.input_error(
-                "MediumReactions.parameters", self.parameters, 'a dict, {"k": 2.0}'
-            )
-        for name in self.parameters:
-            if not (isinstance(name, str) and name.isidentifier()):
-                raise checks.input_error("MediumReactions.parameters", name, "a name, such as 'k'")
         checks.number("MediumReactions.rtol", self.rtol, above=0.0, most=0.1)
         checks.number("MediumReactions.atol", self.atol, above=0.0)
         check_backend("MediumReactions", self.backend)
-        values = {
-            n: checked(f"MediumReactions.{n}", v, CONSTANT) for n, v in self.parameters.items()
-        }
+        values = checked_constants("MediumReactions", self.parameters, CONSTANT)
         object.__setattr__(self, "parameters", read_only(values))
 
     def only_takes(self) -> tuple[str, ...]:
@@ -119,9 +110,10 @@ class MediumReactions(Effect):
         warn_of_steps("MediumReactions", self.parameters, dt)
 
     def bind(self, binding: Binding) -> tuple[BoundEffect, ...]:
-        before = BoundReactions(self, binding)
+        before, after = BoundReactions(self, binding), BoundReactions(self, binding)
         before.stage, before.title = FIRST_REACTIONS, "medium reactions, first half"
-        return before, BoundReactions(self, binding)
+        after.first = before
+        return before, after
 
 
 def _checked_list(given: object) -> tuple[Reaction, ...]:
@@ -150,6 +142,7 @@ class BoundReactions(BoundEffect):
     """Half a step of reactions in the medium, bound to a batch."""
 
     effect: MediumReactions
+    first: BoundReactions | None = None  # the other half, which was traced before
 
     def __init__(self, effect: MediumReactions, binding: Binding):
         super().__init__(effect, binding)
@@ -178,6 +171,10 @@ class BoundReactions(BoundEffect):
 
     def trace(self, state: State) -> State:
         """Find out which signals react, by a trial, and make kernels of the rates."""
+        if self.first is not None:
+            for name in ("read", "written", "part", "compiled", "by_torch"):
+                setattr(self, name, getattr(self.first, name))
+            return state
         if state.layout is None:
             raise checks.InputError(
                 "MediumReactions are of the signals of a medium, and this scene has none: list"
@@ -216,12 +213,7 @@ class BoundReactions(BoundEffect):
         self.written = tuple(n for n in signals if n in changed)
         self.part = network = build_network(reactions, self.read)
         self._known = set(network.parameters)
-        for name in network.parameters:
-            if name not in self.effect.parameters:
-                what = (
-                    f"a reaction needs the parameter {name!r}, which MediumReactions was not given"
-                )
-                raise checks.InputError(unknown(what, name, list(self.effect.parameters)))
+        network.check_parameters("MediumReactions", self.effect.parameters)
 
     def _try(self, rates: Rates, signals: Sequence[str], state: State) -> None:
         """Call the function on some voxels of the medium: with the concentrations at first, with
@@ -285,9 +277,9 @@ class BoundReactions(BoundEffect):
                 " the like rather than math or numpy, torch.where rather than if."
             ) from error
         check_returned(found, self.label)
-        out = {}
+        out, none = {}, torch.empty(0, dtype=torch.float64, device=rows.device)
         for name, value in found.items():
-            made = column(value, rows.numel(), torch.empty(0, device=rows.device).double())
+            made = column(value, rows.numel(), none)
             if made is None:
                 shape = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
                 raise checks.InputError(

@@ -163,8 +163,7 @@ class BoundMonod(BoundEffect):
         return self.transport.compiled
 
     def _reservoir(self) -> tuple[str, ...]:
-        name = f"{self.effect.signal}_reservoir"
-        return (name,) if name in self.binding.declared else ()
+        return self.binding.reservoirs([self.effect.signal])
 
     def reads(self) -> tuple[str, ...]:
         # growth_rate must be there, but Monod sets it whatever it was

@@ -27,7 +27,7 @@ from torchfilm.signals.schedule import warn_of_steps
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import HotReload, edited, load_functions
-from torchfilm.values import CONSTANT, Rule, Value, checked
+from torchfilm.values import CONSTANT, Rule, Value, checked_constants
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,12 +85,7 @@ class Rules(Effect):
                     f"left to {OF_EFFECTS[name]}, which has it: list that beside Rules",
                 )
             checks.number(f"Rules.variables[{name!r}]", value)
-        if not isinstance(self.parameters, Mapping):
-            raise checks.input_error("Rules.parameters", self.parameters, 'a dict, {"k": 2.0}')
-        for name in self.parameters:
-            if not (isinstance(name, str) and name.isidentifier()):
-                raise checks.input_error("Rules.parameters", name, "a name, such as 'k'")
-        constants = {n: checked(f"Rules.{n}", v, CONSTANT) for n, v in self.parameters.items()}
+        constants = checked_constants("Rules", self.parameters, CONSTANT)
         object.__setattr__(self, "parameters", constants)
         object.__setattr__(self, "path", path)
         object.__setattr__(self, "functions", functions)
