@@ -15,6 +15,7 @@ from torchfilm.effects.lysis import Lysis
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.medium import Medium
 from torchfilm.effects.medium_reactions import MediumReactions
+from torchfilm.effects.motility import Motility
 from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
@@ -23,6 +24,7 @@ from torchfilm.initial_cells import Cells
 from torchfilm.inocula import inoculum
 from torchfilm.loop import advance, failures
 from torchfilm.model import Model
+from torchfilm.physics.adhesion import Adhesion
 from torchfilm.physics.walls import Box, Channel, Plane, Sphere
 from torchfilm.replay import GrowthRecording, Replay
 from torchfilm.scene import Scene
@@ -75,6 +77,7 @@ _LAZY = {
 }
 
 __all__ = [
+    "Adhesion",
     "BoundaryConditions",
     "Box",
     "Cells",
@@ -96,6 +99,7 @@ __all__ = [
     "MediumReactions",
     "Model",
     "Monod",
+    "Motility",
     "NoFlux",
     "Normal",
     "Open",

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 # The stages of a step; an effect says where it belongs. The order is the paper's, but for cells
 # that divide at a threshold: they do so in the step in which they get there, not in the next one.
 RULES, FLAGGED_DIVISION, FIRST_REACTIONS, BEFORE_CELLS, NUTRITION, GROWTH = 10, 20, 21, 22, 25, 30
-MECHANICS, GRID_COVERAGE, CIRCUIT, TRANSPORT, LAST_REACTIONS, LYSIS = 40, 45, 50, 60, 65, 70
-DIVISION, REMOVAL = 80, 90
+MOTILITY, MECHANICS, GRID_COVERAGE, CIRCUIT, TRANSPORT, LAST_REACTIONS = 35, 40, 45, 50, 60, 65
+LYSIS, DIVISION, REMOVAL = 70, 80, 90
 
 GEOMETRY = ("position", "axis", "length", "radius")
 # Names that every state has and an effect may read or write beside declared fields.

@@ -8,6 +8,7 @@ from torchfilm.effects.lysis import Lysis
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.medium import Medium
 from torchfilm.effects.medium_reactions import MediumReactions
+from torchfilm.effects.motility import Motility
 from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
@@ -17,6 +18,7 @@ KNOWN = {
     "rules": Rules,
     "nutrition": Monod,
     "growth": Growth,
+    "motility": Motility,
     "mechanics": Mechanics,
     "circuit": Circuit,
     "medium reactions": MediumReactions,

@@ -10,8 +10,10 @@ from torch import Tensor
 
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.mechanics_report import MechanicsReport
-from torchfilm.physics import compiled, torch_step
+from torchfilm.physics import capsule, compiled, torch_step
+from torchfilm.physics.adhesion import Bonds
 from torchfilm.physics.contact_records import ContactSettings
+from torchfilm.physics.contacts import Capsules
 from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.step_records import MechanicsInput
 from torchfilm.physics.surfaces import Surface
@@ -20,6 +22,7 @@ from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.tangents import has_tangent, in_forward_mode
+from torchfilm.tools.vectors import safe_sqrt
 from torchfilm.values import is_drawn, numbers
 
 if TYPE_CHECKING:
@@ -54,7 +57,7 @@ class BoundMechanics(BoundEffect):
         entries = [tensor for surface in surfaces for tensor in _tensors(surface)]
         self.needs_gradient = self.values.requires_grad or any(x.requires_grad for x in entries)
         drawn = (v.field for v in vars(self.values).values() if v is not None)
-        self.fields = (*FIELDS, *(name for name in drawn if name is not None))
+        self.fields = (*FIELDS, *effect.needs(), *(name for name in drawn if name is not None))
         dtype, values = binding.batch.dtype, self.values
         self.drags = [_same(values[n], dtype) for n in ("viscosity", "length_drag")]
         follows = self.compiled and effect.alpha is None and effect.stiffness is None
@@ -141,7 +144,7 @@ class BoundMechanics(BoundEffect):
         walls = compiled.wall_arrays(*self._surfaces(state), state.colony_id, state.cells)
         made, report, substeps = compiled.step(
             self.settings, state.groups, dt, self.effect.max_elongation, cells, self._drags(state),
-            self._alphas(state), walls,
+            self._alphas(state), walls, self._bond_arrays(state),
         )  # fmt: skip
         x, axes, lengths, moves, growths, fallen, *of_contacts = map(torch.from_numpy, made)
         new = {"displacement": moves, "collapsed_steps": fallen}
@@ -219,8 +222,33 @@ class BoundMechanics(BoundEffect):
             fields["compression"] if self.effect.one_sided else None,
             values.viscosity.of_cells(state), values.length_drag.of_cells(state),
             fields.get("drag"), of_cells(values.alpha), of_cells(values.stiffness),
-            state.colony_id, surfaces, walls,
+            state.colony_id, surfaces, walls, self._bonds(state),
         )  # fmt: skip
+
+    def _bonds(self, state: State) -> Bonds | None:
+        """What holds cells together."""
+        kinds = self.effect.adhesion
+        if not kinds:
+            return None
+        levels = []
+        for k, kind in enumerate(kinds):
+            strength = self.values[f"adhesion[{k}].strength"].of_cells(state)
+            root = safe_sqrt(strength.double() / kind.reach).expand(state.cells)
+            adhesin, partner = (
+                root if name is None else root * state.fields[name].double()
+                for name in (kind.adhesin, kind.partner or kind.adhesin)
+            )
+            levels += [adhesin if kind.partner else 0.5 * adhesin, partner]
+        return Bonds(torch.stack(levels, 1), tuple(kind.reach for kind in kinds), _begin(state))
+
+    def _bond_arrays(self, state: State) -> tuple[np.ndarray, ...] | None:
+        bonds = self._bonds(state)
+        if bonds is None:
+            return None
+        cells, numbers_of = bonds.begin, lambda x: as_array(x.contiguous(), torch.float64)
+        arrays = bonds.levels, cells.centre.T, cells.axis.T, cells.half
+        levels, position, axis, half = map(numbers_of, arrays)
+        return levels, np.array(bonds.reaches), position, axis, half
 
     def _surfaces(self, state: State) -> tuple[list[Surface], list[tuple[str, Tensor | None]]]:
         """The surfaces of all walls; the kind of each, and its stiffness or weight, 0-dim or
@@ -233,6 +261,21 @@ class BoundMechanics(BoundEffect):
             surfaces += made
             walls += [(kind, value)] * len(made)
         return surfaces, walls
+
+
+@torch.no_grad()
+def _begin(state: State) -> Capsules:
+    """The cells before they grew in this step and moved by themselves."""
+    fields, position, axis, length = state.fields, state.position, state.axis, state.length
+    if "elongation" in fields:
+        length = length - fields["elongation"]
+    if "drift" in fields:
+        drift = fields["drift"].to(position.dtype)
+        position, axis = (
+            position - drift[:, : state.dim], capsule.rotate(axis, -fields["drift"][:, state.dim :])
+        )  # fmt: skip
+    half = 0.5 * length.double()
+    return Capsules(position.T, axis.double().T, half, state.radius.double())
 
 
 def _tensors(surface: Surface) -> list[Tensor]:

@@ -13,9 +13,10 @@ from torch import Tensor
 
 from torchfilm.effect import GROWTH, Binding, BoundEffect, Effect, is_own
 from torchfilm.resolver import Values
-from torchfilm.state import CELL, Field, State
+from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.doubling import check_doubling
+from torchfilm.tools.row_checks import check_variable
 from torchfilm.tools.warn_once import warn
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, numbers, physical
 
@@ -185,16 +186,7 @@ class Growth(Effect):
     def check(self, state: State, values: Values) -> None:
         for option, names in (("species", self._paid()), ("factor", self._slowed())):
             for name in names:
-                declared = state.declared.get(name)
-                if declared is None or declared.scope != CELL or declared.shape:
-                    there = [n for n, f in state.declared.items() if f.scope == CELL]
-                    rule = "a species of a circuit, or a variable with one number for each cell"
-                    hint = f"There are: {', '.join(there)}."
-                    raise checks.input_error(f"Growth.{option}", name, rule, hint)
-                if bool((~(state.fields[name] >= 0)).any()):
-                    raise checks.InputError(
-                        f"Growth.{option}: {name} of a first cell is below 0; it must be 0 or more."
-                    )
+                check_variable(f"Growth.{option}", name, state, at_least_zero=True)
 
     def check_step(self, dt: float, divides: bool) -> None:
         if self.rate is None or not divides or self.law == "linear":
@@ -322,11 +314,7 @@ def _first_rate(state: State, rows: Tensor, values: Values) -> Tensor:
 
 def _too_long(state: State, good: Tensor) -> GrowthReport:
     """The report of the cells that cannot be as long as they would be, ~good (N,)."""
-    number = torch.arange(state.cells, device=state.device)
-    first = state.cells - state.groups.max(torch.where(good, 0, state.cells - number))
-    row = first.clamp(max=state.cells - 1)
+    row, bad = state.groups.first(~good)
     return GrowthReport(
-        (first < state.cells).long(),
-        state.uid.index_select(0, row),
-        state.growth_rate.detach().index_select(0, row),
+        bad.long(), state.uid.index_select(0, row), state.growth_rate.detach().index_select(0, row)
     )

@@ -18,6 +18,7 @@ from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.random import fine_uniform
 from torchfilm.tools.read_only import read_only
+from torchfilm.tools.row_checks import check_variable
 from torchfilm.values import CONCENTRATION, Rule, Value, checked, physical
 
 AMOUNT = Rule("conc·µm³", least=0.0, scheduled=True)
@@ -173,9 +174,7 @@ class Lysis(Effect):
 
     def check(self, state: State, values: Values) -> None:
         for name in self._variables():
-            declared = state.declared[name]
-            if declared.scope != CELL or declared.shape:
-                raise checks.input_error("Lysis", name, "variables with one number for each cell")
+            check_variable("Lysis", name, state, at_least_zero=name in self.at_least_zero())
 
 
 class BoundLysis(BoundEffect):

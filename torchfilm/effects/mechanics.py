@@ -16,6 +16,7 @@ from torchfilm.kernels.bilateral_scheme import CLOSE, PENALTY, TOLERANCE
 from torchfilm.kernels.scheme import OVERLAP, PASSES
 from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
 from torchfilm.parameters import number_range
+from torchfilm.physics.adhesion import Adhesion
 from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.initial_overlaps import check_apart, check_fits, check_room
 from torchfilm.physics.one_sided_records import OneSidedSettings
@@ -25,11 +26,13 @@ from torchfilm.resolver import Values
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import check_backend, why_torch
-from torchfilm.values import Rule, Value, checked, numbers, physical, quotient, smallest
+from torchfilm.tools.row_checks import check_variable
+from torchfilm.values import Rule, Value, checked, is_drawn, numbers, physical, quotient, smallest
 
 # The default length drag: free growth, but for bilateral contacts, which do not hold in it.
 LENGTH_DRAG = {"one-sided": 1e5, "bilateral": 10.0}
 CONTACTS = ("one-sided", "bilateral")
+STRENGTH = Rule("μ·µm²/h", least=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +61,9 @@ class Mechanics(Effect):
     of a solve. One-sided: relative error of the contact forces, default 0.07. Bilateral: worst
     residual relative to that at rest, default 0.05 or, where α γ is below 0.1, 0.05 · (α γ/0.1)^¼.
     max_iterations: CG iterations a solve. max_elongation: µm; a colony whose cells would grow more
-    in a step takes sub-steps. backend: "compiled" kernels or "torch". Default: compiled where the
-    device is the CPU and no gradient is required.
+    in a step takes sub-steps. adhesion: cells stick together, see `tf.Adhesion`; several kinds add
+    up. Only one-sided contacts have it. backend: "compiled" kernels or "torch". Default: compiled
+    where the device is the CPU and no gradient is required.
     """
 
     walls: Sequence[Wall] = ()
@@ -75,6 +79,7 @@ class Mechanics(Effect):
     tolerance: float | None = None
     max_iterations: int = 2000
     max_elongation: float = 0.25
+    adhesion: Sequence[Adhesion] = ()
     backend: str | None = None
 
     stage = MECHANICS
@@ -99,14 +104,13 @@ class Mechanics(Effect):
             raise checks.InputError(
                 "Mechanics got alpha and stiffness: α = 1/(stiffness·Δt), so give one of the two."
             )
-        if isinstance(self.walls, Wall):
-            hint = f"Write walls=[{type(self.walls).__name__}(…)]."
-            raise checks.input_error("Mechanics.walls", self.walls, "a list of walls", hint)
-        for wall in self.walls:
-            if not isinstance(wall, Wall):
-                raise checks.input_error(
-                    "Mechanics.walls", wall, "a list of Plane, Sphere, Box or Channel"
-                )
+        self._check_parts("walls", Wall, "Plane, Sphere, Box or Channel")
+        self._check_parts("adhesion", Adhesion, "tf.Adhesion(…)")
+        if self.adhesion and not self.one_sided:
+            hint = 'Take contacts="one-sided", the default.'
+            raise checks.input_error(
+                "Mechanics.adhesion", self.adhesion, "left out with bilateral contacts", hint
+            )
         for name in ("passes", "max_iterations"):
             if (given := getattr(self, name)) is not None:
                 object.__setattr__(self, name, checks.integer(f"Mechanics.{name}", given, least=1))
@@ -122,9 +126,18 @@ class Mechanics(Effect):
                 "Mechanics.contact_overlap is for one-sided contacts that follow their force: leave"
                 " it out, or leave out alpha, stiffness and contacts='bilateral'."
             )
-        object.__setattr__(self, "walls", tuple(self.walls))
         self.surfaces()  # raises for a wall that does not fit the dimension
-        self.physical_values()  # raises for a wall value that is not allowed
+        self.physical_values()  # raises for a value of a wall that is not allowed
+
+    def _check_parts(self, name: str, kind: type, rule: str) -> None:
+        given = getattr(self, name)
+        if isinstance(given, kind):
+            hint = f"Write {name}=[{type(given).__name__}(…)]."
+            raise checks.input_error(f"Mechanics.{name}", given, f"a list of {rule}", hint)
+        for part in given:
+            if not isinstance(part, kind):
+                raise checks.input_error(f"Mechanics.{name}", part, f"a list of {rule}")
+        object.__setattr__(self, name, tuple(given))
 
     def surfaces(self) -> list[Surface]:
         """What the walls are made of."""
@@ -177,6 +190,9 @@ class Mechanics(Effect):
                 if getattr(wall, name) is not None:
                     label = f"{type(wall).__name__}.{name}"
                     found[f"walls[{k}].{name}"] = (checked(label, getattr(wall, name), rule), rule)
+        for k, adhesion in enumerate(self.adhesion):
+            strength = checked("Adhesion.strength", adhesion.strength, STRENGTH)
+            found[f"adhesion[{k}].strength"] = strength, STRENGTH
         return found
 
     def declares(self, dim: int) -> tuple[Field, ...]:
@@ -201,9 +217,15 @@ class Mechanics(Effect):
     def _own_fields(self) -> tuple[str, ...]:
         return tuple(field.name for field in self.declares(self.dim))
 
+    def needs(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(name for kind in self.adhesion for name in kind.levels))
+
+    def at_least_zero(self) -> tuple[str, ...]:
+        return self.needs()
+
     def reads(self) -> tuple[str, ...]:
         cells = ("position", "axis", "length", "radius", "elongation", "drag")
-        return (*cells, *self._own_fields)
+        return (*cells, *(("drift",) if self.adhesion else ()), *self._own_fields)
 
     def writes(self) -> tuple[str, ...]:
         return ("position", "axis", "length", "elongation", *self._own_fields)
@@ -211,6 +233,10 @@ class Mechanics(Effect):
     def check(self, state: State, values: Values) -> None:
         if state.dim != self.dim:
             raise checks.input_error("Mechanics.dim", self.dim, f"{state.dim}, like the cells")
+        for kind in self.adhesion:
+            for option in ("adhesin", "partner"):
+                if (name := getattr(kind, option)) is not None:
+                    check_variable(f"Adhesion.{option}", name, state, at_least_zero=True)
         for surface in self.surfaces():
             distance, _ = surface.gap_of_points(state.position, state.own_colony_id)
             behind = torch.nonzero(distance < 0).squeeze(1)
@@ -264,6 +290,7 @@ class Mechanics(Effect):
             lines = self._one_sided_numerics(settings, kind, state.device)
         else:
             lines = self._bilateral_numerics(settings, kind, state.device)
+        lines += [_of_adhesion(kind) for kind in self.adhesion]
         soft = [
             wall for wall in self.walls if wall.stiffness is not None or wall.weight is not None
         ]
@@ -386,3 +413,12 @@ class Mechanics(Effect):
         if settings.penalty is not None:
             return settings.penalty
         return PENALTY if self.alpha is None else smallest(self.alpha) * smallest(self.length_drag)
+
+
+def _of_adhesion(kind: Adhesion) -> str:
+    """An adhesion in words, for `explain`."""
+    strength = kind.strength
+    pull = "drawn" if is_drawn(strength) else f"{number_range(numbers(strength))} μ·µm²/h"
+    levels = " and ".join(kind.levels)
+    by = f", in proportion to {levels} of both cells" if levels else ""
+    return f"adhesion: a pull of up to {pull} at a gap of {kind.reach:g} µm{by}"

@@ -16,9 +16,10 @@ from torchfilm.medium_exchange import MediumExchange
 from torchfilm.resolver import Values
 from torchfilm.signals import uptake
 from torchfilm.signals.compiled_uptake import EVENTS
-from torchfilm.state import CELL, OUTSIDE, Field, State
+from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.doubling import check_doubling
+from torchfilm.tools.row_checks import check_variable
 from torchfilm.values import CONCENTRATION, Value, is_drawn, numbers, physical
 
 CONSTANTS = ("rate", "half", "growth_yield")
@@ -131,15 +132,7 @@ class Monod(Effect):
                 " use Growth() with law='volume'."
             )
         if self.factor is not None:
-            declared = state.declared.get(self.factor)
-            if declared is None or declared.scope != CELL or declared.shape:
-                raise checks.input_error(
-                    "Monod.factor", self.factor, "a variable with one number for each cell"
-                )
-            if bool((~(state.fields[self.factor] >= 0)).any()):
-                raise checks.InputError(
-                    f"Monod.factor: {self.factor} of a first cell is below 0; it must be 0 or more."
-                )
+            check_variable("Monod.factor", self.factor, state, at_least_zero=True)
         if bool((state.growth_rate != 0).any()):
             raise checks.InputError(
                 "Monod sets the growth rate, but Growth has a rate of its own, which would be"

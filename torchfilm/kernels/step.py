@@ -8,6 +8,7 @@ import math
 import numpy as np
 
 from torchfilm.kernels.batch import put, put_back
+from torchfilm.kernels.bonds import add_bonds, bonds_of
 from torchfilm.kernels.colonies import (
     CLIPPED,
     DEEPLY,
@@ -70,12 +71,13 @@ DEEP, TOLERANCE, MOST_PASSES, LIMIT, SOFT, YIELD = range(6)
 
 
 @lean
-def _wall_contacts(memory, x, axis, half, radius, scale, at, found, like, dof):
+def _wall_contacts(memory, x, axis, half, radius, scale, at, found, bonds, like, dof):
     """Rows (H, gaps, one, two, soft) of cells at walls, with room for those of the contacts
-    `found`; how many there are, and the deepest gap. at: the walls, and weight and reach by
-    cell."""
+    `found` and of `bonds`; how many there are, and the deepest gap. at: the walls, and weight and
+    reach by cell."""
     (kinds, places, sizes, is_soft, _), root, reach = at
-    most = most_rows(dof) * found[4].shape[0] + 3 * kinds.shape[0] * x.shape[0]
+    of_pairs = most_rows(dof) * found[4].shape[0] * (2 if bonds[1].shape[0] else 1)
+    most = of_pairs + 3 * kinds.shape[0] * x.shape[0]
     rows = room_for_rows(memory, most, like, dof)
     walls, deepest = wall_rows(
         x, axis, half, radius, scale, kinds, places, sizes, root, reach, rows, is_soft, False, dof,
@@ -169,7 +171,7 @@ def _arrays(memory, length, growth, shortest, last, roots):
 
 @lean
 def _prepared(memory, x, axis, growth, radius, drag, last, first_pass, rising, hardness, softer,
-              walls, alphas, margin, found, arrays, dof):  # fmt: skip
+              walls, alphas, bonds, margin, found, arrays, dof):  # fmt: skip
     """Puts what a pass starts from into its arrays. Returns rows of cells at walls, with room for
     those of `found`, how many there are, and the deepest gap."""
     length, least, half, (reach, root), (alpha, low), scale, y, _, _ = arrays
@@ -180,17 +182,17 @@ def _prepared(memory, x, axis, growth, radius, drag, last, first_pass, rising, h
         alphas, margin, alpha, low, reach, root, dof,
     )  # fmt: skip
     at = walls, root, reach
-    return _wall_contacts(memory, x, axis, half, radius, scale, at, found, last, dof)
+    return _wall_contacts(memory, x, axis, half, radius, scale, at, found, bonds, last, dof)
 
 
 @lean
 def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, hardness, walls,
-                alphas, settings, report, team, dof):  # fmt: skip
+                alphas, bonds, settings, report, team, dof):  # fmt: skip
     """Grow one colony by `growth` and part what overlaps; x, axis, length, last, hardness in place.
 
     x, axis (n, d) float64. length to shortest: (n,). last: (n, D) the move from which to start.
     hardness: (1,) α. walls: kinds, places, sizes, which are soft, and (S, n) their D, or
-    stiffness · Δt. alphas: (n,), or (0,).
+    stiffness · Δt. alphas: (n,), or (0,). bonds: see `kernels.bonds`.
     """
     margin, target, deep, limits, passes = _of_colony(length, growth, radius, drag, settings)
     tolerance, given, is_soft = settings[TOLERANCE], alphas.shape[0] > 0, walls[3]
@@ -198,23 +200,26 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
     arrays = _arrays(memory, length, growth, shortest, last, walls[4])
     half, y, kept = arrays[2], arrays[6], arrays[7]
     number, deeply, softer, rising, held, kept_alpha = 0, False, 1.0, True, 0.0, 0.0
-    found = found_contacts(memory, team, x, axis, half, radius, margin, dof)
+    apart = margin
+    for reach in bonds[1]:
+        apart = max(apart, margin + reach)
+    found = found_contacts(memory, team, x, axis, half, radius, apart, dof)
     report[DEEPLY] = 0 if settings[SOFT] > 0 else deeply_overlapping(memory, found, radius)
     top = memory[1][TOP]
     while number < passes:
         give_back(memory, top)  # the contacts are kept, not what was made of them
         rows, at_walls, deepest = _prepared(
             memory, x, axis, growth, radius, drag, last, number == 0, rising, hardness[0], softer,
-            walls, alphas, margin, found, arrays, dof,
+            walls, alphas, bonds, margin, found, arrays, dof,
         )  # fmt: skip
         if number > 0 and not deeply:  # cells do not lie deep in others; but in a wall?
             if deepest >= -deep:
                 break
-            found, deeply = found_contacts(memory, team, x, axis, half, radius, margin, dof), True
+            found, deeply = found_contacts(memory, team, x, axis, half, radius, apart, dof), True
             top = memory[1][TOP]
             continue
         error, e, m = _solved(
-            memory, x, axis, radius, found, rows, at_walls, deep, margin, number, arrays,
+            memory, x, axis, radius, found, rows, at_walls, deep, margin, number, arrays, bonds,
             2 * target, settings, report, team, dof,
         )  # fmt: skip
         failed = error > tolerance and error < np.inf
@@ -245,7 +250,7 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
         if number < passes:
             give_back(memory, top)
             found, deeply = found_after(
-                memory, team, x, axis, radius, margin, deep, found, arrays, dof
+                memory, team, x, axis, radius, apart, deep, found, arrays, dof
             )
             top = memory[1][TOP]
         if not deeply and is_soft.shape[0] == 0:
@@ -273,7 +278,7 @@ def _carried_out(memory, x, axis, radius, last, gaps, walls, margin, number, arr
 
 
 @lean
-def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, number, arrays, cap,
+def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, number, arrays, bonds, cap,
             settings, report, team, dof):  # fmt: skip
     """Solve a pass, of which `walls` rows are made: the first for all cells, a later one for those
     that lie deep and those near them. Returns the error, each row's gap after the move, and how
@@ -288,6 +293,8 @@ def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, number, a
         )
     else:
         m = pair_rows(memory, x, axis, half, radius, scale, mine, walls, rows, far, dof)
+    if bonds[1].shape[0]:
+        m = add_bonds(rows, walls, m, radius, bonds, alpha, dof)
     error, e = _minimise_some(
         memory, rows, m, numbers, count, alpha, low, y, cap, settings, report, team, dof
     )
@@ -367,10 +374,11 @@ def _mean(values):
 
 
 @lean(entry=True)
-def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, alphas, walls,
-                  settings, out, reports, dof):  # fmt: skip
+def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, alphas, bonds,
+                  walls, settings, out, reports, dof):  # fmt: skip
     """Steps of the colonies `which`, each by itself: `kernels.colonies` describes the arguments.
-    team: a board of threads that assist, or (0,)."""
+    team: a board of threads that assist, or (0,). bonds: as in `kernels.bonds`, of
+    N cells, or of none where none stick together."""
     x, radius, contact_alpha = cells[0], cells[4], cells[7]
     kinds, places, sizes, _, is_soft = walls
     while True:
@@ -393,6 +401,7 @@ def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, 
             )
             shortest = shortest_of(memory, of, length, own_radius, cells)
             own_alphas = alphas_of(memory, of, dt / steps, alphas)
+            own_bonds = bonds_of(memory, of, dt / steps, bonds, dof)
             own_settings = copied(memory, settings, settings.shape[0])
             if steps > 1 and settings[DEEP] <= 0:
                 own_settings[DEEP] = DEEP_IN_SUBSTEPS * _mean(own_radius)
@@ -402,7 +411,7 @@ def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, 
                 step_colony(
                     memory, own_x, own_axis, length, share, own_radius, (mu, gamma), shortest, last,
                     hardness, (kinds, places[:, b], sizes[:, b], is_soft, roots), own_alphas,
-                    own_settings, report, team, dof,
+                    own_bonds, own_settings, report, team, dof,
                 )  # fmt: skip
                 if report[STATUS] == NOT_FINITE:
                     break

@@ -28,8 +28,9 @@ from torchfilm.kernels.scheme import (
     UNMOVED,
 )
 from torchfilm.physics import capsule
+from torchfilm.physics.adhesion import with_bonds
 from torchfilm.physics.adjoint import attach_gradient
-from torchfilm.physics.contacts import CandidateContacts, Capsules
+from torchfilm.physics.contacts import CandidateContacts, Capsules, Contacts
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.near_rows import near_rows
 from torchfilm.physics.neighbours import Neighbourhood
@@ -46,7 +47,7 @@ from torchfilm.physics.wall_contacts import (
 )
 from torchfilm.tools.ragged import marked
 from torchfilm.tools.reads import numbers, rows_where
-from torchfilm.tools.vectors import nearest_root, safe_norm
+from torchfilm.tools.vectors import nearest_root, safe_norm, safe_sqrt
 
 
 def contact_steps(given: StepInput) -> StepResult:
@@ -131,10 +132,11 @@ class _OneStep:
         local, axis = at.position - start.index_select(0, owner), at.axis.double()
         length, radius = at.length.double(), given.radius.double()
         margin = MARGIN * self.wide.index_select(0, owner)
+        apart = margin if given.bonds is None else margin + given.bonds.apart
         pick = lambda x: x.detach().index_select(0, rows)
         near = Neighbourhood(
             pick(local), pick(axis), pick(length), pick(radius),
-            pick(owner), self.groups.size, pick(margin),
+            pick(owner), self.groups.size, pick(apart),
         )  # fmt: skip
         first, second = (rows.index_select(0, side) for side in near.pairs())
         first, second = torch.minimum(first, second), torch.maximum(first, second)
@@ -148,7 +150,7 @@ class _OneStep:
         )
         walls = find_wall_contacts(given.surfaces, position, axis, length, radius, ids, reach=reach)
         walls = replace(walls, cell=rows.index_select(0, walls.cell))
-        return found.nearer_than(margin.index_select(0, first)), walls
+        return found.nearer_than(apart.index_select(0, first)), walls
 
     def _deeply(self, pairs, gap: Tensor, active: Tensor, at: StepResult) -> Tensor:
         """How many cells of each colony lie deeper in another than a radius, (B,)."""
@@ -172,6 +174,16 @@ class _OneStep:
         hard = ~soft & (root >= 1)  # a lighter wall is meant to give way
         limit = self.deep.index_select(0, owner.index_select(0, walls.cell))
         return mark | marked(count, walls.cell, hard & (walls.gap.detach() < -limit))
+
+    def _pair_roots(self, contacts: Contacts, alpha: Tensor) -> tuple[Tensor, Tensor]:
+        """D of each row of two cells, (K, 1), and whether it pulls, (K,) bool."""
+        root, pull = contacts.weight.sqrt(), contacts.pull
+        if pull is None:
+            return root.unsqueeze(1), torch.zeros_like(contacts.first, dtype=torch.bool)
+        pulls = pull.detach() != 0
+        first, second = (alpha.index_select(0, x) for x in (contacts.first, contacts.second))
+        held = safe_sqrt(0.5 * pull * (first + second)) + 0.0 * pull  # also what is not a number
+        return torch.where(pulls, root * held, root).unsqueeze(1), pulls
 
     def _wall_roots(self, walls: WallContacts, alpha: Tensor) -> tuple[Tensor, Tensor]:
         """D of each wall row (W,), and whether the wall is soft, (W,) bool."""
@@ -197,6 +209,8 @@ class _OneStep:
         owner = self.groups.owner.index_select(0, pairs.first)
         margin = MARGIN * self.wide.index_select(0, owner)
         contacts = near_rows(pairs, None if settings.soft else margin)
+        if given.bonds is not None:
+            contacts = with_bonds(contacts, given.bonds)
         solved = self._solved(at, contacts, walls, moving, cells, active, least, first_pass)
         part, end = solved.problem, solved.end
         y = self._with_gradient(part, end)
@@ -301,7 +315,7 @@ class _OneStep:
         length_drag = torch.where(rigid, torch.inf, given.length_drag)
         drag = [across] * settings.dim + [turning] * turns + [length_drag]
         scale = torch.stack(drag, 1).rsqrt()
-        root = contacts.weight.sqrt().unsqueeze(1)
+        root, pulls = self._pair_roots(contacts, alpha)
         wall_root, soft = self._wall_roots(walls, alpha)
         half = lambda row, cell: (row * scale.double().index_select(0, cell)).to(dtype)
         rows = ContactJacobian(
@@ -314,7 +328,7 @@ class _OneStep:
             at.length.shape[0],
         )
         gap = torch.cat([contacts.gap * root.squeeze(1), walls.gap * wall_root]).to(dtype)
-        soft = torch.cat([torch.zeros_like(contacts.first, dtype=torch.bool), soft])
+        soft = torch.cat([pulls, soft])
         applied = torch.zeros_like(gap) if first_pass else torch.where(soft, gap.clamp(max=0), 0.0)
         low = torch.where(
             rigid, 0.0, (least - at.length) * length_drag.sqrt().nan_to_num(posinf=0.0)

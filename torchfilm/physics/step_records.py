@@ -9,6 +9,7 @@ from typing import Generic, TypeVar
 
 from torch import Tensor
 
+from torchfilm.physics.adhesion import Bonds
 from torchfilm.physics.contact_records import ContactReport, ContactSettings
 from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.surfaces import Surface
@@ -27,7 +28,8 @@ class MechanicsInput(Generic[Settings]):
     colony; contact_alpha (N,), α of the last step, and compression (N,) µm: None of bilateral
     contacts. viscosity, length_drag, and alpha or stiffness where one of them is given: 0-dim or
     (N,); drag (N,), a factor of viscosity, or None. colony_id (B,). walls: for each surface its
-    kind ("hard", "stiffness", "weight") and that value, 0-dim or (N,).
+    kind ("hard", "stiffness", "weight") and that value, 0-dim or (N,). bonds: of cells that stick
+    together, or None.
     """
 
     settings: Settings
@@ -51,6 +53,7 @@ class MechanicsInput(Generic[Settings]):
     colony_id: Tensor
     surfaces: Sequence[Surface]
     walls: Sequence[tuple[str, Tensor | None]]
+    bonds: Bonds | None = None
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,7 @@ class StepInput(Generic[Settings]):
     the start and for bilateral contacts; alpha (N,) where it is given, else None, and of bilateral
     contacts always; walls: for each surface its kind ("hard", "stiffness", "weight") and its
     weight, or its stiffness · Δt of the sub-step, (N,); shortest (N,) µm, of one-sided contacts: no
-    cell becomes shorter by pressure.
+    cell becomes shorter by pressure. bonds: with stiffness · Δt of the sub-step, or None.
     """
 
     settings: Settings
@@ -100,6 +103,7 @@ class StepInput(Generic[Settings]):
     surfaces: Sequence[Surface]
     walls: Sequence[tuple[str, Tensor | None]]
     shortest: Tensor
+    bonds: Bonds | None
 
     @property
     def ids(self) -> Tensor:

@@ -47,11 +47,8 @@ class Wall(metaclass=checks.KnownKeywords):
                 "Give only one of stiffness and weight.",
             )
         for which, most in (("stiffness", math.inf), ("weight", 1.0)):
-            given = getattr(self, which)
-            # the effect checks a value per colony (stated), by cell type or drawn
-            stated = hasattr(given, "values") and not isinstance(given, Tensor)
-            if given is not None and not stated and not hasattr(given, "draw"):
-                made = checks.value(f"{name}.{which}", given, above=0.0, most=most)
+            if (given := getattr(self, which)) is not None:
+                made = checks.part_value(f"{name}.{which}", given, above=0.0, most=most)
                 object.__setattr__(self, which, made)
 
     @property

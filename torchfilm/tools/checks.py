@@ -282,6 +282,22 @@ def value(
     return given
 
 
+def part_value(
+    name: str,
+    given: Any,
+    *,
+    above: float = -math.inf,
+    least: float = -math.inf,
+    most: float = math.inf,
+) -> Any:
+    """A value of a part of an effect, such as a wall: as `value`. One that is stated for each
+    colony or cell type, or drawn, stays as it is: the effect checks it."""
+    stated = hasattr(given, "values") and not isinstance(given, Tensor)
+    if stated or hasattr(given, "draw"):
+        return given
+    return value(name, given, above=above, least=least, most=most)
+
+
 def _stacked(given: Sequence[Any], device: torch.device) -> Tensor:
     return torch.stack([torch.as_tensor(x).to(device, torch.float64) for x in given])
 

@@ -216,6 +216,14 @@ class Groups:
         out = torch.segment_reduce(self._sorted(of_kind), "max", offsets=start, unsafe=True)
         return torch.where(self.counts == 0, empty, out).to(value.dtype)
 
+    def first(self, flag: Tensor) -> tuple[Tensor, Tensor]:
+        """The place of the first flagged element of each group, (N,) bool -> (G,); and whether
+        there is one, (G,) bool."""
+        count = flag.numel()
+        place = torch.arange(count, device=flag.device)
+        first = count - self.max(torch.where(flag, count - place, 0))
+        return first.clamp(max=max(count - 1, 0)), first < count
+
     def any(self, flag: Tensor) -> Tensor:
         """Whether any flag of each group is set: (K,) bool -> (size,) bool."""
         return self.max(flag.to(torch.uint8)) > 0

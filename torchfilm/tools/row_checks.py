@@ -166,5 +166,19 @@ def check_signals(fields: Mapping[str, Tensor]) -> None:
             raise checks.input_error(f"the field {name!r}, a signal,", bad, "0 or more everywhere")
 
 
+def check_variable(label: str, name: str, state: Any, at_least_zero: bool = False) -> None:
+    """Raise InputError unless `name` is a number of each cell of a first state; and is not below 0
+    there, where so asked. label: the option by which it was named."""
+    declared = state.declared.get(name)
+    if declared is None or declared.scope != "cell" or declared.shape:
+        there = [n for n, f in state.declared.items() if f.scope == "cell" and not f.shape]
+        rule = "a species of a circuit, or a variable with one number for each cell"
+        raise checks.input_error(label, name, rule, f"There are: {', '.join(there)}.")
+    if at_least_zero and bool((~(state.fields[name] >= 0)).any()):
+        raise checks.InputError(
+            f"{label}: {name} of a first cell is below 0; it must be 0 or more."
+        )
+
+
 def _rule(count: int) -> str:
     return f"a 1-D tensor of whole numbers from 0 to {count - 1}, the rows of cells"

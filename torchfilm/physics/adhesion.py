@@ -1,0 +1,125 @@
+"""Adhesion: cells that touch, or nearly, hold on to each other.
+
+Two cells whose surfaces are g apart pull each other with the force S g / reach, up to S where they
+part: beyond `reach` nothing holds them. S is the strength that both give the pair. What pulls is a
+row of the contact problem like that of a soft wall, turned round: with D² = (S / reach) · α · Δt it
+acts where the gap after the move is above 0, so that the pull is that at the end of the step, and
+any strength is stable. Which pairs hold each other is decided where a step begins, so that a pair
+parts between steps.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchfilm.physics.contacts import CandidateContacts, Capsules, Contacts
+from torchfilm.tools import checks
+from torchfilm.tools.reads import rows_where
+
+
+@dataclass(frozen=True)
+class Adhesion(metaclass=checks.KnownKeywords):
+    """Cells stick together: `tf.Mechanics(adhesion=[tf.Adhesion(strength=100.0)])`.
+
+    strength: μ·µm²/h, the greatest pull between two cells, where they are about to part. (The drag
+    of a cell 4 µm long and 1 µm wide that moves at v µm/h is 5 μm·μ·v.) One number, one per colony,
+    one per cell type, or a distribution drawn at birth. Where two cells differ, the pair has the
+    geometric mean: a cell of strength 0 sticks to none. reach: µm, the gap between surfaces at
+    which a pair parts. The pull is in proportion to the gap: cells that touch are not pulled, and
+    may slide along each other.
+
+    adhesin: name of a species of a circuit, or of a variable of rules, that makes cells stick: the
+    pull is in proportion to the levels in both. partner: name of another one, to which the adhesin
+    binds instead of to itself: adhesin · partner, and partner · adhesin. With levels, `strength` is
+    that of a pair in which they are 1.
+
+    Raises InputError for a strength below 0, a reach that is not above 0, and for a partner without
+    an adhesin.
+    """
+
+    strength: Any
+    reach: float = 0.1
+    adhesin: str | None = None
+    partner: str | None = None
+
+    def __post_init__(self) -> None:
+        given = checks.part_value("Adhesion.strength", self.strength, least=0.0)
+        object.__setattr__(self, "strength", given)
+        reach = checks.number("Adhesion.reach", self.reach, above=0.0, most=MOST_REACH)
+        object.__setattr__(self, "reach", reach)
+        for name in ("adhesin", "partner"):
+            of = getattr(self, name)
+            if of is not None and not (isinstance(of, str) and of.isidentifier()):
+                rule = "the name of a species or a variable of the cells"
+                raise checks.input_error(f"Adhesion.{name}", of, rule)
+        if self.partner is not None and self.adhesin in (None, self.partner):
+            raise checks.input_error(
+                "Adhesion.partner", self.partner, "another name than the adhesin, which is given",
+                "Leave it out where the adhesin binds to itself.",
+            )  # fmt: skip
+
+    @property
+    def levels(self) -> tuple[str, ...]:
+        """What it reads of the cells, beside their strength."""
+        return tuple(name for name in (self.adhesin, self.partner) if name is not None)
+
+
+# µm: pairs that are farther apart have other cells between them.
+MOST_REACH = 5.0
+
+
+@dataclass(frozen=True)
+class Bonds:
+    """What holds pairs of cells together in a step, of K kinds.
+
+    levels: (N, 2 K) float64. A pair (i, j) that is nearer than the reach of kind k as the step
+    begins has the stiffness levels[i, 2k] · levels[j, 2k+1] + levels[i, 2k+1] · levels[j, 2k],
+    μ·µm/h; in the input of contact steps times Δt. reaches: (K,) µm. begin: (N,) the cells as the
+    step begins: before they move by themselves, which would else part them unhindered.
+    """
+
+    levels: Tensor
+    reaches: tuple[float, ...]
+    begin: Capsules
+
+    def over(self, dt: Tensor) -> Bonds:
+        """The same with stiffness · dt; dt: (N,) h, alike in a colony."""
+        return replace(self, levels=self.levels * dt.to(self.levels.dtype).sqrt().unsqueeze(1))
+
+    @property
+    def apart(self) -> float:
+        """Gap, µm, up to which pairs may hold each other."""
+        return max(self.reaches)
+
+    def stiffness(self, first: Tensor, second: Tensor) -> Tensor:
+        """Of pairs of cells, (P,)."""
+        a, b = self.levels.index_select(0, first), self.levels.index_select(0, second)
+        pairs = a[:, 0::2] * b[:, 1::2] + a[:, 1::2] * b[:, 0::2]
+        with torch.no_grad():
+            gap = CandidateContacts.all_of(self.begin, first, second).gap
+        near = [gap < reach for reach in self.reaches]
+        held = (torch.where(x, p, 0.0) for x, p in zip(near, pairs.unbind(1), strict=True))
+        return functools.reduce(torch.add, held)  # in this order, whatever the batch
+
+
+def with_bonds(contacts: Contacts, bonds: Bonds) -> Contacts:
+    """The rows of contacts, and after them those that pull: one for each row at a contact."""
+    assert contacts.far is not None
+    stiffness = bonds.stiffness(contacts.first, contacts.second)
+    (held,) = rows_where((stiffness.detach() != 0) & ~contacts.far)
+    pick = lambda x: x.index_select(0, held)
+    both = lambda x, sign=1: torch.cat([x, sign * pick(x)])
+    return replace(
+        contacts,
+        first=both(contacts.first), second=both(contacts.second), weight=both(contacts.weight),
+        gap=both(contacts.gap, -1), row_first=both(contacts.row_first, -1),
+        row_second=both(contacts.row_second, -1),
+        normal=torch.cat([contacts.normal, -contacts.normal.index_select(1, held)], 1),
+        far=torch.cat([contacts.far, torch.ones_like(pick(contacts.far))]),
+        pull=torch.cat([torch.zeros_like(stiffness), pick(stiffness)]),
+    )  # fmt: skip
