@@ -168,7 +168,7 @@ def walled(state: tf.State, draw: Draw) -> None:
     ):
         return
     reach = 0.5 * state.length.double() + state.radius.double()
-    for surface in mechanics(c, draw.capsules).surfaces():
+    for surface in mechanics(c, draw.capsules, draw.dt).surfaces():
         if surface.wall.yields:
             continue
         distance, _ = surface.gap_of_points(state.position, state.own_colony_id)

@@ -55,7 +55,7 @@ class Contacts:
     the wall, or minus its weight, or None for a hard wall. uneven: each cell has its own viscosity,
     length drag and softness. elongation: µm in a sub-step, one-sided contacts only. tolerance: None
     for the default. drags: length drag and viscosity of each colony, in place of those of all; none
-    if empty.
+    if empty. sticks: strength of adhesion over viscosity · reach / Δt, µm; one-sided contacts only.
     """
 
     give: float | None
@@ -70,6 +70,7 @@ class Contacts:
     elongation: float = 0.25
     tolerance: float | None = None
     drags: tuple[tuple[float, float], ...] = ()
+    sticks: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -115,13 +116,15 @@ class Beside:
 
     eating: cells grow on the signal, if there is one and growth is by volume. rule: action of a
     user rule. leaving: remove cells outside the cube in which they start. bursting: cells burst at
-    random, and what a circuit makes in them goes to the signal, if there are both.
+    random, and what a circuit makes in them goes to the signal, if there are both. moving: speed of
+    cells that move by themselves, µm/h, or None.
     """
 
     eating: bool
     rule: str | None
     leaving: bool
     bursting: bool = False
+    moving: float | None = None
 
 
 @dataclass(frozen=True)
@@ -212,6 +215,7 @@ CONTACTS = st.builds(
     tolerance=st.sampled_from([None, 1e-6]),
     # as many as a draw may have colonies
     drags=st.just(()) | st.tuples(*[st.tuples(powers(0, 6), powers(-2, 2))] * 3),
+    sticks=st.sampled_from([0.0, 0.0, 1.0, 1e2, 1e4]),
 )
 GROWING = st.builds(
     Growing,
@@ -259,6 +263,7 @@ BESIDE = st.builds(
     rule=st.sampled_from([None, "grow", "divide", "remove", "read"]),
     leaving=st.sampled_from([False, False, True]),
     bursting=st.sampled_from([False, False, True]),
+    moving=st.sampled_from([None, None, None, 0.1, 10.0]),
 )
 NO_OTHERS = Beside(eating=False, rule=None, leaving=False)
 TIMES = {
@@ -285,7 +290,7 @@ PUSHING = st.builds(
     growing=st.none() | GROWING,
     outside=st.none(),
     inside=st.none(),
-    beside=st.just(NO_OTHERS),
+    beside=st.builds(replace, st.just(NO_OTHERS), moving=st.sampled_from([None, None, 1.0])),
     dtype=st.sampled_from(["float64", "float64", "float32"]),
     **TIMES,
 )

@@ -65,13 +65,17 @@ def each(draw: Contacts, value: float | torch.Tensor) -> Any:
     return tf.LogNormal(value, 1.0) if draw.uneven else value
 
 
-def mechanics(draw: Contacts, capsules: Capsules) -> tf.Mechanics:
+def mechanics(draw: Contacts, capsules: Capsules, dt: float) -> tf.Mechanics:
     """Returns the contact mechanics of a draw."""
     given: dict[str, Any] = {}
     if draw.give is not None:
         given["alpha" if draw.give > 0 else "stiffness"] = each(draw, abs(draw.give))
     if draw.contacts == "one-sided":
         given |= {"passes": draw.passes, "max_elongation": draw.elongation}
+        least = min([draw.viscosity, *(viscosity for _, viscosity in draw.drags)])
+        if draw.sticks:
+            strength = draw.sticks * least * 0.2 / dt
+            given["adhesion"] = [tf.Adhesion(each(draw, strength), reach=0.2)]
     length_drag, viscosity = draw.length_drag, draw.viscosity
     if draw.drags:
         columns = zip(*draw.drags[: len(capsules.counts)], strict=True)
@@ -230,10 +234,12 @@ def circuit(draw: Inside, outside: Outside | None) -> tf.Circuit:
 def scene_of(draw: Draw) -> tuple[tf.Scene, tf.State]:
     """Returns the scene and its first state. Raises tf.InputError for an invalid draw."""
     effects: list[tf.Effect] = [] if draw.growing is None else growing(draw)
-    effects += [] if draw.contacts is None else [mechanics(draw.contacts, draw.capsules)]
+    effects += [] if draw.contacts is None else [mechanics(draw.contacts, draw.capsules, draw.dt)]
     effects += [] if draw.outside is None else [medium(draw.outside, draw.capsules.dim)]
     effects += [] if draw.inside is None else [circuit(draw.inside, draw.outside)]
     effects += rules(draw)
+    if draw.beside.moving is not None:
+        effects.append(tf.Motility(draw.beside.moving, reversals=1.0, turning=1e-4 / draw.dt))
     if draw.beside.bursting:
         both = draw.inside is not None and draw.outside is not None
         effects.append(tf.Lysis(rate=2.0, releases={"ahl": ("a", "b")} if both else None))

@@ -19,6 +19,7 @@ STEPS = {
     "quorum_sensing": 8,
     "boundary_detector": 8,
     "synchronized_lysis": 8,
+    "strain_sorting": 20,
     "random_partition": 8,
     "nutrient_limited": 8,
 }

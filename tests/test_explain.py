@@ -242,6 +242,7 @@ def test_every_effect_that_torchfilm_has_is_known_and_has_words():
         tf.Rules(watching),
         tf.Circuit(plain, species="m"),
         medium(),
+        tf.Motility(1.0, reversals=1.0),
         tf.Lysis(rate=0.1),
         tf.MediumReactions(lambda s, p: {"ahl": -s.ahl}),
         tf.Removal((-50, -50), (50, 50)),

@@ -250,14 +250,24 @@ def test_pressure_of_cells_apart_and_of_what_is_no_scene():
         tf.measure.pressure(tf.Scene(tf.Growth(rate=1.0), dim=2).bind().start(), scene)
 
 
-def test_forces_need_one_sided_contacts_and_plain_stiffness():
-    wall = tf.Plane(y=-2.0, facing="+y", stiffness={0: 10.0})
+def test_forces_need_one_sided_contacts_and_a_stiffness_that_is_not_drawn():
+    wall = tf.Plane(y=-2.0, facing="+y", stiffness=tf.Uniform(9.0, 10.0))
     both = (tf.Mechanics(dim=2, contacts="bilateral"), tf.Mechanics(dim=2, walls=[wall]))
     states = [list(tf.simulate(tf.Scene(m), until=0.025))[-1] for m in both]
     with pytest.raises(tf.InputError, match="contact_alpha"):
         tf.measure.wall_forces(states[0], [tf.Plane(y=-2.0, facing="+y")], 0.025)
     with pytest.raises(tf.InputError, match=r"Plane\.stiffness.*one number"):
         tf.measure.wall_forces(states[1], [wall], 0.025)
+
+
+def test_a_wall_may_be_softer_for_one_type_of_cells():
+    """Both ends of two cells are 0.1 µm deep in it: 2 · (10 + 40) · 0.1, while they stay there."""
+    wall = tf.Plane(y=-0.4, facing="+y", stiffness={0: 10.0, 1: 40.0})
+    cells = tf.Cells([[0, 0], [9, 0]], [[1, 0], [1, 0]], 2.0, cell_type=[0, 1])
+    scene = tf.Scene(tf.Mechanics(dim=2, walls=[wall]), founders=cells, dt=1e-6)
+    *_, state = tf.simulate(scene, until=1e-6, dtype=torch.float64)
+    found = tf.measure.wall_forces(state, [wall], 1e-6).force
+    assert float(found[0, 0]) == pytest.approx(10.0, rel=1e-3)
 
 
 def test_growth_rates_are_those_that_pressure_leaves():

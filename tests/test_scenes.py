@@ -24,6 +24,7 @@ SMALL = {
     "boundary_detector": {"d3": [0.0, 1e-3]},
     "boundary_detector under flow": {"flow": 5.0},
     "synchronized_lysis": {"threshold": [2.0, 4.0], "half": 0.01, "lysis_rate": 1.0},
+    "strain_sorting": {"strength": [0.0, 300.0], "cells": 40, "chamber": 10.0},
     "random_partition": {},
     "repressilator": {"alpha": [216.0, 100.0], "noise": False, "rate": 1.0},
     "toggle_switch": {"strength": [10.0, 12.0], "speed": 2, "molecules_per_unit": 2.0, "rate": 1.0},
@@ -53,14 +54,15 @@ def test_it_runs_and_its_recipe_builds_it_again(kind):
     assert scene.name == again.name == kind.split()[0]
     a, b = (run(s, s.bind(2, seed=1, per_colony=True).start(), 3.0) for s in (scene, again))
     assert (a.counts >= 4).all() and torch.isfinite(a.position).all()
-    for name in ("uid", "position", "axis", "length", "growth_rate", "division_threshold"):
+    for name in ("uid", "position", "axis", "length", *a.fields):
         assert torch.equal(getattr(a, name), getattr(b, name)), name
 
 
 @pytest.mark.parametrize("kind", list(SMALL))
 def test_it_explains_itself(kind):
     scene = small(kind)
-    assert "growth -> mechanics" in scene.bind(2, per_colony=True).describe()
+    moves = "motility" if kind == "strain_sorting" else "growth"
+    assert f"{moves} -> mechanics" in scene.bind(2, per_colony=True).describe()
     assert len(READY[kind.split()[0]].__doc__) > 60
 
 

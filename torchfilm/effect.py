@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
 # The stages of a step; an effect says where it belongs. The order is the paper's, but for cells
 # that divide at a threshold: they do so in the step in which they get there, not in the next one.
-RULES, FLAGGED_DIVISION, FIRST_REACTIONS, BEFORE_CELLS, NUTRITION, GROWTH = 10, 20, 21, 22, 25, 30
-MOTILITY, MECHANICS, GRID_COVERAGE, CIRCUIT, TRANSPORT, LAST_REACTIONS = 35, 40, 45, 50, 60, 65
+RULES, FLAGGED_DIVISION, FIRST_REACTIONS, BEFORE_CELLS, NUTRITION, MOTILITY = 10, 20, 21, 22, 25, 28
+GROWTH, MECHANICS, GRID_COVERAGE, CIRCUIT, TRANSPORT, LAST_REACTIONS = 30, 40, 45, 50, 60, 65
 LYSIS, DIVISION, REMOVAL = 70, 80, 90
 
 GEOMETRY = ("position", "axis", "length", "radius")

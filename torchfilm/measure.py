@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import torch
 from torch import Tensor
 
+from torchfilm.physics.adhesion import Bonds, levels_of
 from torchfilm.physics.contacts import CandidateContacts, Capsules, gaps_nearby
 from torchfilm.physics.near_rows import near_rows
 from torchfilm.physics.surfaces import FlatSurface
@@ -22,6 +23,7 @@ from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.vectors import cross, safe_norm
+from torchfilm.values import ByType, PerColony, Rule, checked, is_drawn
 
 if TYPE_CHECKING:
     from torchfilm.scene import Scene
@@ -104,8 +106,7 @@ def wall_forces(state: State, walls: Sequence[Wall], dt: float) -> WallForces:
 
     A contact pushes with its overlap / (α Δt), on a soft wall with its overlap × stiffness. Divide
     by the length of a wall (2-D) or its area for the pressure, averaged over steps: one step's is
-    as exact as its solve. walls: those of the scene's Mechanics, with one stiffness or one for each
-    colony.
+    as exact as its solve. walls: those of the scene's Mechanics, whose stiffness is not drawn.
     """
     _check_walls("wall_forces", walls)
     soft = _softness("wall_forces", state, checks.number("wall_forces(dt)", dt, above=0.0))
@@ -157,7 +158,7 @@ def _pushed_by_walls(state: State, surfaces: Sequence[Any], soft: Tensor) -> _Pu
     placed = state.position, state.axis.double(), length, radius
     rows = find_wall_contacts(surfaces, *placed, state.own_colony_id)
     # D² / (α Δt) of each cell at each surface: a stiffness
-    hold = torch.stack([_held(s.wall, soft, state.own_colony_id) for s in surfaces])
+    hold = torch.stack([_held(s.wall, soft, state) for s in surfaces])
     root = rows.row[:, : state.dim].norm(dim=1)
     force = root * -rows.gap * hold[rows.surface, rows.cell]
     arm = radius[rows.cell] + (length[rows.cell] * rows.row[:, -1] + rows.gap) / root
@@ -176,7 +177,8 @@ def pressure(state: State, scene: Scene, dt: float | None = None) -> Tensor:
     between them do not: in a full chamber the mean, weighted by size, is the pressure on the walls
     over the share of the chamber that the cells fill. Overlaps give the forces with an error of
     second order in dt: in a full chamber, where cells still shift, 5 % at 0.025 h, 0.5 % at
-    0.00625 h. dt: of the last step, h; by default that of the scene.
+    0.00625 h. Adhesion pulls: where it does so more than contacts push, the pressure is below 0.
+    dt: of the last step, h; by default that of the scene.
 
     Raises InputError for bilateral contacts, and for a state that is not as a step returned it: it
     lacks the number of sub-steps.
@@ -191,7 +193,8 @@ def pressure(state: State, scene: Scene, dt: float | None = None) -> Tensor:
     soft_cells = any(e.soft_contacts for e in scene.effects)
     total = torch.zeros_like(soft)
     at_walls = _pushed_by_walls(state, surfaces, soft)
-    for pushes in (*_pushed_by_cells(state, soft, soft_cells), at_walls):
+    bonds = _bonds(state, scene)
+    for pushes in (*_pushed_by_cells(state, soft, soft_cells, bonds), at_walls):
         virial = (pushes.force * pushes.arm).unsqueeze(1)
         total = total + Groups(pushes.cell, state.cells).sum(virial).squeeze(1)
     length, radius = state.length.double(), state.radius.double()
@@ -199,20 +202,26 @@ def pressure(state: State, scene: Scene, dt: float | None = None) -> Tensor:
     return total / (2 * from_above if state.dim == 2 else 3 * state.volume.double())
 
 
-def _pushed_by_cells(state: State, soft: Tensor, soft_cells: bool) -> tuple[_Pushes, _Pushes]:
-    """The pushes of a contact on its first cell and on its second. soft: as `_softness` says,
-    (N,)."""
+def _pushed_by_cells(
+    state: State, soft: Tensor, soft_cells: bool, bonds: Bonds | None
+) -> tuple[_Pushes, _Pushes]:
+    """The pushes of a contact on its first cell and on its second, below 0 where they pull. soft:
+    as `_softness` says, (N,)."""
     axis, length, radius = state.axis.double(), state.length.double(), state.radius.double()
+    apart = 0.0 if bonds is None else bonds.apart
     first, second, gap = gaps_nearby(
-        state.position, axis, length, radius, state.colony, state.colonies
+        state.position, axis, length, radius, state.colony, state.colonies, apart
     )
-    deep = torch.nonzero(gap < 0).squeeze(1)
-    first, second = first.index_select(0, deep), second.index_select(0, deep)
+    near = torch.nonzero(gap < apart).squeeze(1)
+    first, second = first.index_select(0, near), second.index_select(0, near)
     start = state.position.index_select(0, state.groups.begin[:-1].index_select(0, state.colony))
     capsules = Capsules((state.position - start).T, axis.T, 0.5 * length, radius)
-    margin = None if soft_cells else torch.zeros_like(gap.index_select(0, deep))
+    margin = None if soft_cells else torch.zeros_like(gap.index_select(0, near))
     rows = near_rows(CandidateContacts.all_of(capsules, first, second), margin)
     force = rows.weight * (-rows.gap).clamp(min=0) / soft.index_select(0, rows.first)
+    if bonds is not None:
+        stiffness = bonds.stiffness(rows.first, rows.second)
+        force = force - rows.weight * stiffness * rows.gap.clamp(min=0)
 
     def on(cell: Tensor, row: Tensor) -> _Pushes:
         normal, turn = row[:, : state.dim], row[:, state.dim : -1]
@@ -228,17 +237,47 @@ def _pushed_by_cells(state: State, soft: Tensor, soft_cells: bool) -> tuple[_Pus
     return on(rows.first, rows.row_first), on(rows.second, rows.row_second)
 
 
-def _held(wall: Wall, soft: Tensor, ids: Tensor) -> Tensor:
+def _bonds(state: State, scene: Scene) -> Bonds | None:
+    """What holds the cells together as they now are."""
+    from torchfilm.effects.mechanics import Mechanics  # it imports rooms that measure
+
+    for effect in scene.effects:
+        if isinstance(effect, Mechanics) and effect.adhesion:
+            names = [f"adhesion[{k}].strength" for k in range(len(effect.adhesion))]
+            values, drawn = effect.physical_values(), effect.kept_values()
+            strengths = [
+                state.fields[drawn[n].name] if n in drawn else _of_cells(values[n][0], state)
+                for n in names
+            ]
+            levels = levels_of(effect.adhesion, strengths, state.fields, state.cells)
+            cells = state.position.T, state.axis.double().T, 0.5 * state.length.double()
+            begin = Capsules(*cells, state.radius.double())
+            return Bonds(levels, tuple(kind.reach for kind in effect.adhesion), begin)
+    return None
+
+
+def _of_cells(value: Any, state: State) -> Tensor:
+    """A value that is not drawn, one number, one for each colony or cell type, of each cell."""
+    if isinstance(value, ByType):
+        own = torch.zeros_like(state.length, dtype=torch.float64)
+        for kind, of_kind in value.values.items():
+            own = torch.where(state.cell_type == kind, _of_cells(of_kind, state), own)
+        return own
+    given = value.values if isinstance(value, PerColony) else value
+    each = torch.as_tensor(given, dtype=torch.float64, device=state.device)
+    own = each.index_select(0, state.own_colony_id) if each.dim() else each
+    return own.expand(state.cells)
+
+
+def _held(wall: Wall, soft: Tensor, state: State) -> Tensor:
     given = wall.weight if wall.stiffness is None else wall.stiffness
     if given is None:
         return 1.0 / soft
-    try:
-        value = torch.as_tensor(given, dtype=torch.float64, device=soft.device)
-    except (TypeError, ValueError, RuntimeError):
-        name = f"{type(wall).__name__}.{'weight' if wall.stiffness is None else 'stiffness'}"
-        rule = "one number or one for each colony, to measure forces"
-        raise checks.input_error(name, given, rule) from None
-    own = value.index_select(0, ids) if value.dim() else value.expand(soft.shape)
+    name = f"{type(wall).__name__}.{'weight' if wall.stiffness is None else 'stiffness'}"
+    if is_drawn(given := checked(name, given, Rule(above=0.0))):
+        rule = "one number or one for each colony or cell type, to measure forces"
+        raise checks.input_error(name, given, rule)
+    own = _of_cells(given, state)
     return own if wall.stiffness is not None else own * own / soft
 
 

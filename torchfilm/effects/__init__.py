@@ -17,8 +17,8 @@ from torchfilm.effects.rules import Rules
 KNOWN = {
     "rules": Rules,
     "nutrition": Monod,
-    "growth": Growth,
     "motility": Motility,
+    "growth": Growth,
     "mechanics": Mechanics,
     "circuit": Circuit,
     "medium reactions": MediumReactions,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +12,7 @@ from torch import Tensor
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.mechanics_report import MechanicsReport
 from torchfilm.physics import capsule, compiled, torch_step
-from torchfilm.physics.adhesion import Bonds
+from torchfilm.physics.adhesion import Bonds, levels_of
 from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.contacts import Capsules
 from torchfilm.physics.one_sided_records import OneSidedSettings
@@ -22,7 +23,6 @@ from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.tangents import has_tangent, in_forward_mode
-from torchfilm.tools.vectors import safe_sqrt
 from torchfilm.values import is_drawn, numbers
 
 if TYPE_CHECKING:
@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 # The least tolerance of contact forces, in units of rounding. Below one unit solves in float32 were
 # seen to report convergence while cells came to lie in one another.
 FINEST = 8
+# The most that strength · Δt / (reach · viscosity) of adhesion may be, µm. In growth to 128 cells
+# in the plane, solves failed from 1e6 on.
+STIFFEST = 1e5
 # What a step reads, as far as derivatives may pass through it.
 PARTS = ("position", "axis", "length", "radius")
 FIELDS = ("elongation", "displacement", "contact_alpha", "compression", "drag")
@@ -81,6 +84,7 @@ class BoundMechanics(BoundEffect):
         """Also raise InputError where contacts are so hard that drag, which selects among moves
         that part cells alike, is lost in rounding."""
         super().check_step(dt, divides)
+        self._check_adhesion(dt)
         effect, dtype = self.effect, self.binding.batch.dtype
         name = "alpha" if effect.stiffness is None else "stiffness"
         given = getattr(effect, name)
@@ -100,6 +104,21 @@ class BoundMechanics(BoundEffect):
                 " rounding of such hard contacts",
                 "Leave it out: by default contacts are as hard as they need be.",
             )
+
+    def _check_adhesion(self, dt: float) -> None:
+        """Raise InputError for bonds so stiff that solves would not converge."""
+        viscosity = self.effect.viscosity
+        least = 1.0 if is_drawn(viscosity) else float(numbers(viscosity).min())
+        for kind in self.effect.adhesion:
+            most = STIFFEST * least * kind.reach / dt
+            strongest = float(numbers(kind.strength).max())
+            if most < strongest < math.inf:
+                raise checks.input_error(
+                    "Adhesion.strength", strongest,
+                    f"at most {most:.3g} μ·µm²/h with this reach, in steps of {dt:g} h: solves for"
+                    " the contacts would not converge",
+                    "No cell pulls so hard; a tenth of it holds as well.",
+                )  # fmt: skip
 
     @property
     def by_kernels(self) -> bool:
@@ -144,7 +163,7 @@ class BoundMechanics(BoundEffect):
         walls = compiled.wall_arrays(*self._surfaces(state), state.colony_id, state.cells)
         made, report, substeps = compiled.step(
             self.settings, state.groups, dt, self.effect.max_elongation, cells, self._drags(state),
-            self._alphas(state), walls, self._bond_arrays(state),
+            self._alphas(state), walls, self._bond_arrays(state, length - growth),
         )  # fmt: skip
         x, axes, lengths, moves, growths, fallen, *of_contacts = map(torch.from_numpy, made)
         new = {"displacement": moves, "collapsed_steps": fallen}
@@ -212,37 +231,32 @@ class BoundMechanics(BoundEffect):
     def _given(self, state: State, dt: float) -> MechanicsInput:
         fields, values = state.fields, self.values
         elongation = fields.get("elongation")
+        elongation = torch.zeros_like(state.length) if elongation is None else elongation
         of_cells = lambda value: None if value is None else value.of_cells(state)
         surfaces, walls = self._surfaces(state)
         return MechanicsInput(
             self.settings, dt, self.effect.max_elongation, state.groups, state.position, state.axis,
-            state.length, torch.zeros_like(state.length) if elongation is None else elongation,
-            state.radius, fields["displacement"], fields["collapsed_steps"],
+            state.length, elongation, state.radius,
+            fields["displacement"], fields["collapsed_steps"],
             fields["contact_alpha"] if self.effect.one_sided else None,
             fields["compression"] if self.effect.one_sided else None,
             values.viscosity.of_cells(state), values.length_drag.of_cells(state),
             fields.get("drag"), of_cells(values.alpha), of_cells(values.stiffness),
-            state.colony_id, surfaces, walls, self._bonds(state),
+            state.colony_id, surfaces, walls,
+            self._bonds(state, (state.length - elongation).detach()),
         )  # fmt: skip
 
-    def _bonds(self, state: State) -> Bonds | None:
-        """What holds cells together."""
+    def _bonds(self, state: State, base: Tensor) -> Bonds | None:
+        """What holds cells together. base: (N,) µm, lengths before growth."""
         kinds = self.effect.adhesion
         if not kinds:
             return None
-        levels = []
-        for k, kind in enumerate(kinds):
-            strength = self.values[f"adhesion[{k}].strength"].of_cells(state)
-            root = safe_sqrt(strength.double() / kind.reach).expand(state.cells)
-            adhesin, partner = (
-                root if name is None else root * state.fields[name].double()
-                for name in (kind.adhesin, kind.partner or kind.adhesin)
-            )
-            levels += [adhesin if kind.partner else 0.5 * adhesin, partner]
-        return Bonds(torch.stack(levels, 1), tuple(kind.reach for kind in kinds), _begin(state))
+        strengths = [self.values[f"adhesion[{k}].strength"] for k in range(len(kinds))]
+        levels = levels_of(kinds, [x.of_cells(state) for x in strengths], state.fields, state.cells)
+        return Bonds(levels, tuple(kind.reach for kind in kinds), _begin(state, base))
 
-    def _bond_arrays(self, state: State) -> tuple[np.ndarray, ...] | None:
-        bonds = self._bonds(state)
+    def _bond_arrays(self, state: State, base: np.ndarray) -> tuple[np.ndarray, ...] | None:
+        bonds = self._bonds(state, torch.from_numpy(base))
         if bonds is None:
             return None
         cells, numbers_of = bonds.begin, lambda x: as_array(x.contiguous(), torch.float64)
@@ -264,18 +278,13 @@ class BoundMechanics(BoundEffect):
 
 
 @torch.no_grad()
-def _begin(state: State) -> Capsules:
+def _begin(state: State, base: Tensor) -> Capsules:
     """The cells before they grew in this step and moved by themselves."""
-    fields, position, axis, length = state.fields, state.position, state.axis, state.length
-    if "elongation" in fields:
-        length = length - fields["elongation"]
-    if "drift" in fields:
-        drift = fields["drift"].to(position.dtype)
-        position, axis = (
-            position - drift[:, : state.dim], capsule.rotate(axis, -fields["drift"][:, state.dim :])
-        )  # fmt: skip
-    half = 0.5 * length.double()
-    return Capsules(position.T, axis.double().T, half, state.radius.double())
+    position, axis, drift = state.position, state.axis, state.fields.get("drift")
+    if drift is not None:
+        position = position - drift[:, : state.dim].to(position.dtype)
+        axis = capsule.rotate(axis, -drift[:, state.dim :])
+    return Capsules(position.T, axis.double().T, 0.5 * base.double(), state.radius.double())
 
 
 def _tensors(surface: Surface) -> list[Tensor]:

@@ -195,14 +195,11 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
     stiffness · Δt. alphas: (n,), or (0,). bonds: see `kernels.bonds`.
     """
     margin, target, deep, limits, passes = _of_colony(length, growth, radius, drag, settings)
-    tolerance, given, is_soft = settings[TOLERANCE], alphas.shape[0] > 0, walls[3]
+    tolerance, given, apart = settings[TOLERANCE], alphas.shape[0] > 0, _apart(margin, bonds)
     hardness[0] = hardness[0] if hardness[0] > 0 else limits[0]
     arrays = _arrays(memory, length, growth, shortest, last, walls[4])
     half, y, kept = arrays[2], arrays[6], arrays[7]
     number, deeply, softer, rising, held, kept_alpha = 0, False, 1.0, True, 0.0, 0.0
-    apart = margin
-    for reach in bonds[1]:
-        apart = max(apart, margin + reach)
     found = found_contacts(memory, team, x, axis, half, radius, apart, dof)
     report[DEEPLY] = 0 if settings[SOFT] > 0 else deeply_overlapping(memory, found, radius)
     top = memory[1][TOP]
@@ -253,7 +250,7 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
                 memory, team, x, axis, radius, apart, deep, found, arrays, dof
             )
             top = memory[1][TOP]
-        if not deeply and is_soft.shape[0] == 0:
+        if not deeply and walls[3].shape[0] == 0:
             break
 
 
@@ -331,6 +328,15 @@ def _of_colony(base, growth, radius, drag, settings):
     passes = 1.0 if settings[SOFT] > 0 else settings[MOST_PASSES]
     limits = softest, hardest, max(PEAK * deep, PEAKED * target)
     return MARGIN * wide, target, deep, limits, passes
+
+
+@lean
+def _apart(margin, bonds):
+    """The gap, µm, up to which pairs have rows: those that push, and those that stick together."""
+    reaches, most = bonds[1], 0.0
+    for k in range(reaches.shape[0]):
+        most = max(most, reaches[k])
+    return margin + most
 
 
 @lean

@@ -3,14 +3,15 @@
 Two cells whose surfaces are g apart pull each other with the force S g / reach, up to S where they
 part: beyond `reach` nothing holds them. S is the strength that both give the pair. What pulls is a
 row of the contact problem like that of a soft wall, turned round: with D² = (S / reach) · α · Δt it
-acts where the gap after the move is above 0, so that the pull is that at the end of the step, and
-any strength is stable. Which pairs hold each other is decided where a step begins, so that a pair
+acts where the gap after the move is above 0: the pull is that at the end of the step, so that
+strong bonds are stable. Which pairs hold each other is decided where a step begins, so that a pair
 parts between steps.
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +21,7 @@ from torch import Tensor
 from torchfilm.physics.contacts import CandidateContacts, Capsules, Contacts
 from torchfilm.tools import checks
 from torchfilm.tools.reads import rows_where
+from torchfilm.tools.vectors import safe_sqrt
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,22 @@ class Bonds:
         near = [gap < reach for reach in self.reaches]
         held = (torch.where(x, p, 0.0) for x, p in zip(near, pairs.unbind(1), strict=True))
         return functools.reduce(torch.add, held)  # in this order, whatever the batch
+
+
+def levels_of(
+    kinds: Sequence[Adhesion], strengths: Sequence[Tensor], fields: Mapping[str, Tensor], cells: int
+) -> Tensor:
+    """The levels of `Bonds`, (N, 2 K). strengths: of each kind, 0-dim or (N,). fields: of the
+    cells, by name."""
+    levels: list[Tensor] = []
+    for kind, strength in zip(kinds, strengths, strict=True):
+        root = safe_sqrt(strength.double() / kind.reach).expand(cells)
+        adhesin, partner = (
+            root if name is None else root * fields[name].double()
+            for name in (kind.adhesin, kind.partner or kind.adhesin)
+        )
+        levels += [adhesin if kind.partner else 0.5 * adhesin, partner]
+    return torch.stack(levels, 1)
 
 
 def with_bonds(contacts: Contacts, bonds: Bonds) -> Contacts:

@@ -64,6 +64,7 @@ channel = _ready(channels.channel)
 quorum_sensing = _ready(signalling.quorum_sensing)
 boundary_detector = _ready(signalling.boundary_detector)
 synchronized_lysis = _ready(signalling.synchronized_lysis)
+strain_sorting = _ready(colonies.strain_sorting)
 random_partition = _ready(circuits.random_partition)
 repressilator = _ready(circuits.repressilator)
 toggle_switch = _ready(circuits.toggle_switch)
@@ -78,6 +79,7 @@ READY: dict[str, Callable[..., Scene]] = {
         quorum_sensing,
         boundary_detector,
         synchronized_lysis,
+        strain_sorting,
         random_partition,
         repressilator,
         toggle_switch,
