@@ -86,7 +86,7 @@ def choose(
             f"{about}: {luck}; small colonies first, with all replicates; CMA-ES learns from the"
             f" best{hint}",
         )
-    data = "data of a colony of one size: a smaller one does not compare"
+    data = "colonies of one size are wanted: a smaller one does not compare"
     fit = Chosen(cloud, f"{data}; CMA-ES learns from all{hint}")
     if botorch:
         learnt = Chosen(

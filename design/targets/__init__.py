@@ -5,6 +5,7 @@ from design.targets.composition import Composition
 from design.targets.goals import Burden, Constrained, Duration, Goals, Spread, Weighted
 from design.targets.image import Image
 from design.targets.lasting import Lasting
+from design.targets.measured import Measured
 from design.targets.observed import Observed
 from design.targets.observed_course import ObservedCourse
 from design.targets.oscillation import Oscillation
@@ -23,6 +24,7 @@ __all__ = [
     "Gradient",
     "Image",
     "Lasting",
+    "Measured",
     "Observed",
     "ObservedCourse",
     "OnFraction",

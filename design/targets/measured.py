@@ -1,0 +1,136 @@
+"""The target for measures of one's own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+import torchfilm as tf
+from design.targets.base import Target
+from torchfilm import checks
+
+Measure = Callable[[tf.State], Tensor]
+FARTHEST = 100.0  # spreads: a measure that is farther off counts as so far
+
+
+@dataclass(frozen=True)
+class Measured(Target):
+    """Measures of your own have the wanted values:
+
+        Measured({"order": tf.measure.nematic_order}, {"order": (0.5, 0.8)}, {"order": 0.1})
+
+    functions: by name, functions of a state that return one number for each colony, (B,), from the
+    cells of that colony alone. wanted: of each, a number, or the range (low, high) within which any
+    will do; ±inf for an open end. spread: of each, above 0, by how much off counts as 1.
+
+    Loss: the mean over the measures of ((measure − wanted)/spread)², 0 within a range. It has no
+    upper limit but 100², a measure 100 spreads off. A colony in which a measure is not a number has
+    failed. For several processes, functions stand at the top level of a file.
+    """
+
+    failed = FARTHEST**2
+    pattern = False
+    functions: Mapping[str, Measure]
+    wanted: Mapping[str, float | tuple[float, float]]
+    spread: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.functions, Mapping) or not self.functions:
+            rule = "a dict of functions by name, such as {'order': tf.measure.nematic_order}"
+            raise checks.input_error("Measured.functions", self.functions, rule)
+        for name, function in self.functions.items():
+            if not isinstance(name, str) or not name.isidentifier():
+                raise checks.input_error("Measured.functions", name, "names, such as 'order'")
+            if not callable(function):
+                raise checks.input_error(f"Measured.functions[{name!r}]", function, "a function")
+        for option in ("wanted", "spread"):
+            given = getattr(self, option)
+            if not isinstance(given, Mapping) or given.keys() != self.functions.keys():
+                rule = f"a dict with the names {', '.join(map(repr, self.functions))}"
+                raise checks.input_error(f"Measured.{option}", given, rule)
+        ranges = {name: _range(name, self.wanted[name]) for name in self.functions}
+        object.__setattr__(self, "wanted", ranges)
+        for name in self.functions:
+            checks.number(f"Measured.spread[{name!r}]", self.spread[name], above=0.0)
+
+    def check(self, state: tf.State) -> None:
+        self._found(state)
+
+    def unfit(self, state: tf.State) -> list[str]:
+        bad = [
+            (name, found.isnan())
+            for name, found in zip(self.functions, self._found(state), strict=True)
+        ]
+        why = [", ".join(n for n, nan in bad if bool(nan[k])) for k in range(state.colonies)]
+        return [f"{names} is not a number" if names else "" for names in why]
+
+    def why_rough(self, state: tf.State) -> str:
+        return "measures of your own may pass no gradient"
+
+    def _found(self, state: tf.State) -> list[Tensor]:
+        """Each measure of each colony, (B,) float64."""
+        out = []
+        for name, function in self.functions.items():
+            found = function(state)
+            if not isinstance(found, Tensor) or found.shape != (state.colonies,):
+                got = (
+                    f"a tensor of shape {tuple(found.shape)}"
+                    if isinstance(found, Tensor)
+                    else found
+                )
+                rule = f"a function whose result has shape ({state.colonies},), one for each colony"
+                raise checks.input_error(f"Measured.functions[{name!r}]", got, rule)
+            out.append(found.double())
+        return out
+
+    def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        parts = []
+        for name, found in zip(self.functions, self._found(state), strict=True):
+            low, high = self.wanted[name]  # type: ignore[misc]
+            apart = (found - low).clamp(max=0.0) + (found - high).clamp(min=0.0)
+            parts.append((apart / self.spread[name]).clamp(-FARTHEST, FARTHEST))
+        return torch.stack(parts, 1) / math.sqrt(len(parts))
+
+    def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        apart = self.residuals(state)
+        # one after the other: the bits of a sum along rows may depend on their number
+        loss = sum((a * a for a in apart.unbind(1)), apart.new_zeros(len(apart)))
+        return torch.where((state.counts > 0) & ~loss.isnan(), loss, self.failed)
+
+    @torch.no_grad()
+    def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
+        """The measures by name, (B,) each."""
+        return dict(zip(self.functions, self._found(state), strict=True))
+
+    def why_undefined(self, measure: str) -> str:
+        return "its function returned no number there" if measure in self.functions else ""
+
+    @property
+    def bounds(self) -> dict[str, str]:
+        return {name: _words(low, high) for name, (low, high) in self.wanted.items()}  # type: ignore[misc]
+
+    def describe(self) -> str:
+        return ", ".join(f"{name} {words}" for name, words in self.bounds.items())
+
+
+def _range(name: str, given: object) -> tuple[float, float]:
+    label = f"Measured.wanted[{name!r}]"
+    if not isinstance(given, tuple | list):
+        value = checks.number(label, given)
+        return value, value
+    ends = [x if isinstance(x, float) and math.isinf(x) else checks.number(label, x) for x in given]
+    if len(ends) != 2 or not ends[0] <= ends[1] or ends[0] == math.inf or ends[1] == -math.inf:
+        raise checks.input_error(label, given, "a number, or a range (low, high)")
+    return ends[0], ends[1]
+
+
+def _words(low: float, high: float) -> str:
+    if low == high:
+        return f"= {low:g}"
+    if math.isinf(low) or math.isinf(high):
+        return f"≥ {low:g}" if math.isinf(high) else f"≤ {high:g}"
+    return f"{low:g} to {high:g}"

@@ -1,0 +1,121 @@
+"""The target for measures of one's own."""
+
+import math
+
+import pytest
+import torch
+
+import torchfilm as tf
+from design import Local, Measured, Parameter, Search, Sobol, Task, Weighted
+from design.saved_design import load_design
+
+
+def longest(state: tf.State) -> torch.Tensor:
+    return state.groups.max(state.length)
+
+
+def spread_out(state: tf.State) -> torch.Tensor:
+    return state.counts / state.groups.sum(state.length) - 0.25
+
+
+def undefined(state: tf.State) -> torch.Tensor:
+    return torch.where(state.counts > 1, torch.nan, 1.0)
+
+
+def colonies(lengths, owner) -> tf.State:
+    count = len(lengths)
+    places = [[20.0 * k, 0.0] for k in range(count)]
+    cells = tf.Cells(places, [[1.0, 0.0]] * count, lengths, colony=owner)
+    return tf.Scene(tf.Growth(rate=1.0), founders=cells).bind().start()
+
+
+def test_the_loss_by_hand():
+    target = Measured(
+        {"longest": longest, "rest": spread_out}, {"longest": 3.0, "rest": (0.0, 0.25)},
+        {"longest": 0.5, "rest": 0.1},
+    )  # fmt: skip
+    state = colonies([2.0, 4.0, 1.0], [0, 0, 1])
+    # 4 where 3 is wanted, and 2/6 − 1/4; 1 where 3 is wanted, and 1/1 − 1/4
+    wanted = [(2.0**2 + 0.0) / 2, (4.0**2 + 5.0**2) / 2]
+    assert target.loss(state).tolist() == pytest.approx(wanted)
+    assert target.residuals(state).square().sum(1).tolist() == pytest.approx(wanted)
+    assert target.measures(state)["longest"].tolist() == [4.0, 1.0]
+    assert target.describe() == "longest = 3, rest 0 to 0.25"
+    for k in range(2):
+        assert float(target.loss(state.select([k]))) == pytest.approx(wanted[k])
+
+
+def test_open_ranges_and_the_farthest():
+    state = colonies([2.0], [0])
+    for wanted, loss in (((1.0, math.inf), 0.0), ((-math.inf, 1.0), 100.0), (1e9, 1e4)):
+        target = Measured({"longest": longest}, {"longest": wanted}, {"longest": 0.1})
+        assert target.loss(state).tolist() == pytest.approx([loss])
+
+
+def test_a_measure_that_is_no_number_fails_its_colony():
+    target = Measured({"it": undefined}, {"it": 1.0}, {"it": 1.0})
+    state = colonies([2.0, 2.0, 2.0], [0, 0, 1])
+    assert target.unfit(state) == ["it is not a number", ""]
+    assert target.loss(state).tolist() == [target.failed, 0.0]
+
+
+def grown(rate=1.0, noise=0.0) -> tf.Scene:
+    return tf.Scene(tf.Growth(rate=rate), dim=2)
+
+
+OF_TASK = {"until": 0.5, "dt": 0.05, "replicates": 1}
+
+
+def parameters() -> list[Parameter]:
+    return [Parameter("rate", 0.1, 2.0)]
+
+
+def task(target) -> Task:
+    return Task(grown, parameters(), target, **OF_TASK)
+
+
+def test_a_search_finds_it():
+    """A cell of 2 µm that grows by its volume, l + 4r/3 = 2.67, to a length of 4.0 in 0.5 h."""
+    target = Measured({"longest": longest}, {"longest": 4.0}, {"longest": 0.05})
+    rate = math.log((4.0 + 2 / 3) / (2.0 + 2 / 3)) / 0.5
+    search = Search(grown, parameters(), target, **OF_TASK, method=Local(first=16), finals=None)
+    best = search.run(colonies=100)
+    assert best.values["rate"] == pytest.approx(rate, rel=0.01)
+    both, state = Weighted([(target, 1.0), (target, 2.0)]), colonies([3.9], [0])
+    assert float(both.loss(state)) == pytest.approx(3.0 * float(target.loss(state)), rel=1e-6)
+
+
+def test_a_saved_design_asks_for_it_again(tmp_path):
+    target = Measured({"longest": longest}, {"longest": 4.0}, {"longest": 0.05})
+    best = Search(grown, parameters(), target, **OF_TASK, method=Sobol(batch=4)).run(colonies=8)
+    best.save(tmp_path / "best.json")
+    with pytest.raises(tf.InputError, match=r"give load_design\(…, target=…\)"):
+        load_design(tmp_path / "best.json", scene=grown).colonies()
+    again = load_design(tmp_path / "best.json", scene=grown, target=target)
+    assert len(again.colonies()) == 1
+
+
+@pytest.mark.parametrize(
+    "made, words",
+    [
+        (lambda: Measured({}, {}, {}), "a dict of functions by name"),
+        (lambda: Measured({"a b": longest}, {"a b": 1}, {"a b": 1}), "names, such as"),
+        (lambda: Measured({"a": 3}, {"a": 1}, {"a": 1}), r"functions\['a'\] = 3"),
+        (lambda: Measured({"a": longest}, {"b": 1}, {"a": 1}), "wanted .* the names 'a'"),
+        (lambda: Measured({"a": longest}, {"a": 1}, 0.1), "spread .* the names 'a'"),
+        (lambda: Measured({"a": longest}, {"a": (2, 1)}, {"a": 1}), r"range \(low, high\)"),
+        (lambda: Measured({"a": longest}, {"a": math.nan}, {"a": 1}), r"wanted\['a'\] = nan"),
+        (lambda: Measured({"a": longest}, {"a": 1}, {"a": 0}), r"spread\['a'\] = 0"),
+        (
+            lambda: task(Measured({"a": lambda s: s.length[:0]}, {"a": 1}, {"a": 1})),
+            r"functions\['a'\] = 'a tensor of shape \(0,\)",
+        ),
+        (
+            lambda: task(Measured({"a": lambda s: 2.0}, {"a": 1}, {"a": 1})),
+            r"functions\['a'\] = 2.0 is not allowed",
+        ),
+    ],
+)
+def test_bad_input(made, words):
+    with pytest.raises(tf.InputError, match=words):
+        made()
