@@ -239,7 +239,9 @@ def scene_of(draw: Draw) -> tuple[tf.Scene, tf.State]:
     effects += [] if draw.inside is None else [circuit(draw.inside, draw.outside)]
     effects += rules(draw)
     if draw.beside.moving is not None:
-        effects.append(tf.Motility(draw.beside.moving, reversals=1.0, turning=1e-4 / draw.dt))
+        effects.append(
+            tf.Motility(draw.beside.moving, reversals=0.1 / draw.dt, turning=1e-4 / draw.dt)
+        )
     if draw.beside.bursting:
         both = draw.inside is not None and draw.outside is not None
         effects.append(tf.Lysis(rate=2.0, releases={"ahl": ("a", "b")} if both else None))

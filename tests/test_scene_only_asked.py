@@ -99,7 +99,8 @@ def test_an_effect_that_is_not_listed_leaves_no_field_and_no_report():
         "division_threshold",
     }
     # only one-sided contacts follow their force
-    for contacts, own in (("one-sided", {"contact_alpha", "compression"}), ("bilateral", set())):
+    of_force = {"contact_alpha", "contact_substeps", "compression"}
+    for contacts, own in (("one-sided", of_force), ("bilateral", set())):
         scene = tf.Scene(tf.Mechanics(dim=2, contacts=contacts))
         assert set(scene.bind().start().fields) == {"displacement", "collapsed_steps", *own}
         assert set(step(scene, scene.bind().start(), 0.1).reports) == {"mechanics"}

@@ -311,7 +311,7 @@ class BoundEffect:
         kept = self.effect.kept_values()
         out = []
         for name, (value, _) in self.effect.physical_values().items():
-            if isinstance(value, ByType):
+            if isinstance(value, ByType) and CELL_TYPE not in out:
                 out.append(CELL_TYPE)
             if name in kept:
                 first = DrawnValue(self.values[name])

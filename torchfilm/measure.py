@@ -127,13 +127,12 @@ def _softness(measure: str, state: State, dt: float) -> Tensor:
             f"{measure}: the state has no contact_alpha, the softness of one-sided contacts:"
             " simulate with tf.Mechanics(contacts='one-sided'), the default."
         )
-    report: Any = state.reports.get("mechanics")
-    if report is None:
+    steps = state.fields.get("contact_substeps")
+    if steps is None or bool((steps < 1).any()):
         raise checks.InputError(
-            f"{measure}: the state does not say in how many sub-steps its contacts were solved."
-            " Give it as a step returns it: not a first one, nor one from a file or by select."
+            f"{measure}: the state does not say in how many sub-steps its contacts were solved:"
+            " it is a first one, or from a file of an earlier version. Give it as a step made it."
         )
-    steps = state.groups.spread(report.substeps.clamp(min=1))
     return state.contact_alpha.double() * dt / steps
 
 
@@ -180,8 +179,7 @@ def pressure(state: State, scene: Scene, dt: float | None = None) -> Tensor:
     0.00625 h. Adhesion pulls: where it does so more than contacts push, the pressure is below 0.
     dt: of the last step, h; by default that of the scene.
 
-    Raises InputError for bilateral contacts, and for a state that is not as a step returned it: it
-    lacks the number of sub-steps.
+    Raises InputError for bilateral contacts, and for a first state.
     """
     from torchfilm.scene import Scene  # it imports rooms that measure
 
@@ -208,7 +206,7 @@ def _pushed_by_cells(
     """The pushes of a contact on its first cell and on its second, below 0 where they pull. soft:
     as `_softness` says, (N,)."""
     axis, length, radius = state.axis.double(), state.length.double(), state.radius.double()
-    apart = 0.0 if bonds is None else bonds.apart
+    apart = 0.0 if bonds is None else max(bonds.reaches)
     first, second, gap = gaps_nearby(
         state.position, axis, length, radius, state.colony, state.colonies, apart
     )
@@ -220,7 +218,7 @@ def _pushed_by_cells(
     rows = near_rows(CandidateContacts.all_of(capsules, first, second), margin)
     force = rows.weight * (-rows.gap).clamp(min=0) / soft.index_select(0, rows.first)
     if bonds is not None:
-        stiffness = bonds.stiffness(rows.first, rows.second)
+        stiffness = bonds.stiffness(rows.first, rows.second, rows.gap)
         force = force - rows.weight * stiffness * rows.gap.clamp(min=0)
 
     def on(cell: Tensor, row: Tensor) -> _Pushes:

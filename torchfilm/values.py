@@ -118,7 +118,8 @@ def checked(name: str, given: object, rule: Rule, forms: str = FORMS) -> Any:
             return checked_values(name, given, partial(_checked_in_schedule, rule))
         hint = (
             "A Schedule is for the source, flow, reservoir and faces of a Medium, the constants of"
-            " Circuit and Rules (parameters=), and Lysis; rules also call it, schedule(cells.time)."
+            " Circuit and Rules (parameters=), Lysis and Motility; rules also call it,"
+            " schedule(cells.time)."
         )
         raise checks.input_error(name, given, "constant", hint)
     if isinstance(given, ByType):

@@ -47,6 +47,11 @@ def test_reversals_follow_their_rate_at_any_step(dt):
     assert float(kept.mean()) == pytest.approx(math.exp(-1.2), abs=4 / math.sqrt(12000))
 
 
+def test_reversals_too_often_for_the_step_are_told():
+    with pytest.warns(UserWarning, match=r"reverses up to 1 times in a step.* 1.31 times.*0.005 h"):
+        last(tf.Scene(tf.Motility(1.0, reversals=50.0), founders=far_apart(2), dt=0.02), 0.04)
+
+
 def test_cells_that_reverse_spread_as_a_persistent_walk():
     """⟨x²⟩ = v²/k · (t − (1 − exp(−2kt))/(2k)), within four standard errors."""
     scene = tf.Scene(tf.Motility(20.0, reversals=3.0), founders=far_apart(1000), dt=0.02)
@@ -73,7 +78,7 @@ def test_turning_is_rotational_diffusion(dim):
 def test_factors_multiply_speed_and_reversals():
     cells = far_apart(4, extra={"run": [1.0, 0.0, 0.5, 2.0], "turns": [0.0, 0.0, 0.0, 0.0]})
     scene = tf.Scene(
-        tf.Motility(10.0, factor="run", reversals=50.0, reversal_factor="turns"),
+        tf.Motility(10.0, factor="run", reversals=2.0, reversal_factor="turns"),
         founders=cells, dt=0.1,
     )  # fmt: skip
     state = last(scene, 0.5, seed=1)
@@ -197,15 +202,79 @@ def test_daughters_go_their_mothers_way():
         assert float(state.heading[k]) == mothers[int(state.parent[k])]
 
 
-def test_too_fast_to_meet_others_fails_its_colony():
+def test_what_becomes_too_fast_to_meet_others_fails_its_colony():
+    def faster(cells):
+        cells.run = cells.run * torch.where(cells.colony == 1, 2.0, 1.0)
+
     scene = tf.Scene(
-        tf.Motility(tf.PerColony([10.0, 20.0])), tf.Mechanics(dim=2), founders=far_apart(3), dt=0.01
-    )
+        tf.Rules(faster, variables={"run": 1.0}), tf.Motility(10.0, factor="run"),
+        tf.Mechanics(dim=2), founders=far_apart(3), dt=0.01,
+    )  # fmt: skip
     with pytest.raises(SimulationError, match=r"colony 1.*cell 0 would move 0.2 µm in one step"):
         list(tf.simulate(scene, until=0.1, colonies=2))
     with pytest.warns(RuntimeWarning, match="colony 1"):
         state = [s for s in tf.simulate(scene, until=0.1, colonies=2, on_failure="drop")][-1]
     assert state.counts.tolist() == [3, 0]
+
+
+def test_the_most_that_is_allowed_runs_in_both_precisions():
+    for dtype in (torch.float32, torch.float64):
+        for speed, dt in ((3.0, 0.05), (6.0, 0.025)):
+            scene = tf.Scene(tf.Motility(speed), tf.Mechanics(dim=2), founders=far_apart(2), dt=dt)
+            assert last(scene, 2 * dt, dtype=dtype).cells == 2
+
+
+@BACKENDS
+@pytest.mark.parametrize("parts", [1, 2, 4])
+def test_sub_steps_change_no_force(parts, backend):
+    """Of a cell that pushes a wall with 3 · 10, while another one far away grows by 0.1 µm a step,
+    which takes sub-steps."""
+    wall = tf.Plane(x=2.0, facing="-x")
+    cells = tf.Cells(
+        [[0.0, 0.0], [-50.0, 0.0]], [X] * 2, 2.0,
+        extra={"speed": [10.0, 0.0], "heading": [1.0] * 2, "growth_rate": [0.0, 10.0]},
+    )  # fmt: skip
+    scene = tf.Scene(
+        tf.Motility(1.0, factor="speed"), tf.Growth(law="linear"),
+        tf.Mechanics(dim=2, walls=[wall], tolerance=1e-6, max_elongation=0.101 / parts,
+                     backend=backend),
+        founders=cells, dt=0.01,
+    )  # fmt: skip
+    state = last(scene, 0.5, dtype=torch.float64)
+    assert int(state.contact_substeps[0]) == parts
+    force = tf.measure.wall_forces(state, [wall], 0.01).force
+    assert float(force[0, 0]) == pytest.approx(30.0, rel=0.01)
+
+
+def test_sub_steps_change_no_bond():
+    """As above, of a pair that is pulled with 15: ¾ of its reach at a strength of 20."""
+    cells = tf.Cells(
+        [[0.0, 0.0], [3.0, 0.0], [0.0, 50.0]], [X] * 3, 2.0,
+        extra={"speed": [0.0, 10.0, 0.0], "heading": [1.0] * 3, "growth_rate": [0.0, 0.0, 10.0]},
+    )  # fmt: skip
+    gaps = []
+    for elongation in (0.25, 0.03):
+        scene = tf.Scene(
+            tf.Motility(1.0, factor="speed"), tf.Growth(law="linear"),
+            tf.Mechanics(dim=2, tolerance=1e-6, max_elongation=elongation,
+                         adhesion=[tf.Adhesion(20.0, reach=0.2)]),
+            founders=cells, dt=0.01,
+        )  # fmt: skip
+        state = last(scene, 0.5, dtype=torch.float64)
+        gaps.append(float(pair_gaps(state, np.array([[0, 1]]))[0]))
+    assert int(state.contact_substeps[0]) == 4
+    assert gaps == pytest.approx([0.15, 0.15], rel=1e-2)
+
+
+def test_a_state_that_goes_on_without_motility_forgets_it():
+    """The last move of a pair that has just parted must not hold it."""
+    scene = in_a_row([0.0, 10.0], 0.05, adhesion=[tf.Adhesion(1e-3, reach=0.1)])
+    model = scene.bind(dtype=torch.float64)
+    state = model.step(model.start())
+    assert float(pair_gaps(state, np.array([[0, 1]]))[0]) > 0.1
+    still = tf.Scene(tf.Mechanics(dim=2, adhesion=[tf.Adhesion(100.0, reach=0.1)]), dt=0.01)
+    after = [s for s in tf.simulate(still, state, until=0.1)][-1]
+    assert torch.equal(after.position, state.position)
 
 
 def test_without_others_any_speed_will_do():
@@ -242,7 +311,31 @@ def test_gradients_pass_through_speed():
                     until=0.1,
                 )
             ),
-            "Motility.turning = 10.0 is not allowed: it must be at most 0.5",
+            r"Motility.turning: in a step of 0.01 h .* turn by 0.447 rad.*at most 0.002 h",
+        ),
+        (
+            lambda: list(
+                tf.simulate(
+                    tf.Scene(
+                        tf.Motility(1.0, turning=1.0),
+                        tf.Mechanics(dim=2),
+                        founders=far_apart(2),
+                        dt=0.015,
+                    ),
+                    until=0.15,
+                )
+            ),
+            r"Motility.turning: .* move its ends by 0.346 radii.*at most 0.011 h",
+        ),
+        (
+            lambda: list(tf.simulate(in_a_row([20.0], 0.0), until=0.1)),
+            r"Motility.speed: in a step of 0.01 h a first cell would move by 0.4 radii.*0.0074 h",
+        ),
+        (
+            lambda: tf.Scene(
+                tf.Motility(1.0), founders=far_apart(2, extra={"heading": [1.0, 0.5]})
+            ).bind(),
+            "heading of a first cell is neither 1 nor −1",
         ),
         (
             lambda: tf.Scene(tf.Motility(1.0, factor="run"), founders=far_apart(2)),

@@ -11,6 +11,7 @@ from helpers import array, check_always, crowd, growth, mechanics, pair_gaps, ru
 
 import torchfilm as tf
 from torchfilm.tools.checks import InputError, SimulationError
+from torchfilm.tools.tangents import forward_mode
 
 BACKENDS = pytest.mark.parametrize("backend", ["compiled", "torch"])
 ENDS = {2: ((1.0, 0.0), (1.0, 0.0)), 3: ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))}
@@ -107,6 +108,45 @@ def test_what_both_cells_have_decides(first, kind, wanted):
     assert strength_of(first, kind) == pytest.approx(wanted, rel=1e-4, abs=1e-9)
 
 
+THREE = [40.0, 10.0, 20.0]
+
+
+@pytest.mark.parametrize(
+    "strength",
+    [
+        {0: 40.0, 1: 10.0}, THREE, {0: THREE, 1: 5.0}, tf.PerColony(THREE), torch.tensor(10.0),
+        tf.Uniform(10.0, 40.0), {0: tf.Uniform(10.0, 40.0), 1: 5.0},
+    ],
+)  # fmt: skip
+def test_every_kind_of_value_runs_and_is_explained(strength):
+    scene = stuck(pair(0.05, cell_type=[0, 1]), tf.Adhesion(strength))
+    *_, state = tf.simulate(scene, until=0.04, colonies=3)
+    assert bool((pair_gaps(state, np.array([[0, 1], [2, 3], [4, 5]])) < 0.04).all())
+    assert "adhesion: a pull of" in str(tf.explain(scene, colonies=3))
+    by_type = strength.values() if isinstance(strength, dict) else ()
+    listed = isinstance(strength, list | tf.PerColony) or THREE in by_type
+    assert any("adhesion" in path for path, _ in scene.per_colony()) == listed
+
+
+@BACKENDS
+@pytest.mark.parametrize("angle, half", [(2, 0.5), (5, 1.5), (10, 1.5), (10, 3.0), (30, 1.5)])
+@pytest.mark.parametrize("gap", [0.0, 0.05])
+def test_a_pair_at_an_angle_pulls_at_most_with_its_strength(backend, angle, half, gap):
+    """Nearly parallel cells hold on to each other at two places, each with half of the strength,
+    where these are within the reach."""
+    turn, r = math.radians(angle), 0.5
+    along = np.array([math.cos(turn), math.sin(turn)])
+    cells = tf.Cells(
+        [[0.0, 0.0], np.array([-half, 2 * r + gap]) + half * along], [[1.0, 0.0], along], 2 * half
+    )
+    scene = stuck(cells, tf.Adhesion(100.0), dt=1e-6, backend=backend)
+    start = scene.bind(dtype=torch.float64).start()
+    state = step(scene, start, 1e-6)
+    force = float((state.position - start.position)[1].norm()) / 1e-6 * (2 * half + 1)
+    assert force <= 100.0 * 1.001
+    assert gap == 0.0 or force >= (24.9 if 2 < angle < 25 else 49.9)
+
+
 def test_two_kinds_add_up():
     kinds = tf.Adhesion(30.0), tf.Adhesion(5.0, reach=0.2, adhesin="a")
     for gap, stiffness in ((0.05, 300 + 25 * 4), (0.15, 25 * 4)):
@@ -195,7 +235,7 @@ def test_strong_bonds_hold_in_growth(dt, dim):
     and its contacts are clean: bonds pull only cells that are apart. From 2 to 64 cells and more.
     """
     grown = []
-    for strength in (0.0, 100.0, 1e5 * 0.1 / dt):
+    for strength in (0.0, 100.0, 2.5e4 * 0.1 / dt):
         scene = tf.Scene(
             tf.Growth(1.0),
             tf.Mechanics(dim=dim, adhesion=[tf.Adhesion(strength)] if strength else []),
@@ -261,7 +301,7 @@ def _spoil(cells):
         (lambda: tf.Adhesion(-1.0), r"Adhesion.strength = -1"),
         (
             lambda: list(tf.simulate(stuck(pair(0.1), tf.Adhesion(1e7)), until=0.1)),
-            r"strength = 10000000.0 is not allowed: it must be at most 5e\+05",
+            r"strength = 10000000.0 is not allowed: it must be at most 1.25e\+05",
         ),
         (lambda: tf.Adhesion(1.0, reach=0.0), r"Adhesion.reach = 0"),
         (lambda: tf.Adhesion(1.0, reach=math.inf), r"Adhesion.reach = inf"),
@@ -270,6 +310,8 @@ def _spoil(cells):
         (lambda: tf.Adhesion(1.0, adhesin="2b"), r"Adhesion.adhesin = '2b'"),
         (lambda: tf.Mechanics(adhesion=tf.Adhesion(1.0)), r"Write adhesion=\[Adhesion"),
         (lambda: tf.Mechanics(adhesion=[1.0]), r"a list of tf.Adhesion"),
+        (lambda: tf.Mechanics(adhesion=1.0), r"Mechanics.adhesion = 1.0 .* a list of tf.Adhesion"),
+        (lambda: tf.Mechanics(walls=None), r"Mechanics.walls = None .* a list of Plane"),
         (
             lambda: tf.Mechanics(adhesion=[tf.Adhesion(1.0)], contacts="bilateral"),
             r"left out with bilateral contacts",
@@ -287,6 +329,25 @@ def _spoil(cells):
 def test_bad_input(made, words):
     with pytest.raises(InputError, match=words):
         made()
+
+
+@BACKENDS
+def test_infinity_times_nothing_fails_too(backend):
+    scene = stuck(
+        pair(0.05, extra={"a": [1.0, 0.0]}), tf.Adhesion(10.0, adhesin="a"), backend=backend
+    )
+    state = scene.bind(dtype=torch.float64).start()
+    state = step(scene, state.with_fields(a=torch.tensor([math.inf, 0.0]).double()), 0.02)
+    assert ["not finite" in failure.reason for failure in tf.failures(state)] == [True]
+
+
+def test_forward_mode_is_refused():
+    scene = stuck(pair(0.05, extra={"a": [1.0, 1.0]}), tf.Adhesion(10.0, adhesin="a"))
+    state = scene.bind(dtype=torch.float64).start()
+    with forward_mode():
+        dual = torch.autograd.forward_ad.make_dual(state.a, torch.ones_like(state.a))
+        with pytest.raises(InputError, match="no forward mode"):
+            step(scene, state.with_fields(a=dual), 0.02)
 
 
 def test_it_is_explained():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,9 +32,10 @@ if TYPE_CHECKING:
 # The least tolerance of contact forces, in units of rounding. Below one unit solves in float32 were
 # seen to report convergence while cells came to lie in one another.
 FINEST = 8
-# The most that strength · Δt / (reach · viscosity) of adhesion may be, µm. In growth to 128 cells
-# in the plane, solves failed from 1e6 on.
-STIFFEST = 1e5
+# The most that strength · Δt / (viscosity · reach) of adhesion may be, µm; a reach above USUAL does
+# not count. In growth to 128 cells solves failed from 1e6 on, and in motile colonies from 1e5 on;
+# at a reach of 5 µm cells were pressed through others from 2e5 on.
+STIFFEST, USUAL = 2.5e4, 0.1
 # What a step reads, as far as derivatives may pass through it.
 PARTS = ("position", "axis", "length", "radius")
 FIELDS = ("elongation", "displacement", "contact_alpha", "compression", "drag")
@@ -65,6 +67,10 @@ class BoundMechanics(BoundEffect):
         self.drags = [_same(values[n], dtype) for n in ("viscosity", "length_drag")]
         follows = self.compiled and effect.alpha is None and effect.stiffness is None
         self.alphas = compiled.alpha_arrays(None, None, dtype) if follows else None
+        self.drifts = False
+
+    def check_others(self, effects: Sequence[BoundEffect]) -> None:
+        self.drifts = any("drift" in effect.writes() for effect in effects)
 
     def _check_precision(self) -> None:
         """Raise InputError for forces that are wanted more exactly than the states' numbers are."""
@@ -110,7 +116,7 @@ class BoundMechanics(BoundEffect):
         viscosity = self.effect.viscosity
         least = 1.0 if is_drawn(viscosity) else float(numbers(viscosity).min())
         for kind in self.effect.adhesion:
-            most = STIFFEST * least * kind.reach / dt
+            most = STIFFEST * least * min(kind.reach, USUAL) / dt
             strongest = float(numbers(kind.strength).max())
             if most < strongest < math.inf:
                 raise checks.input_error(
@@ -138,6 +144,7 @@ class BoundMechanics(BoundEffect):
             fields["elongation"] = found.elongation
         if found.contact_alpha is not None and found.compression is not None:
             fields |= {"contact_alpha": found.contact_alpha, "compression": found.compression}
+            fields["contact_substeps"] = state.groups.spread(found.substeps)
         report = MechanicsReport(**vars(found.report), substeps=found.substeps)
         return state.with_fields(**fields).replace(
             position=found.position, axis=found.axis, length=found.length,
@@ -173,6 +180,7 @@ class BoundMechanics(BoundEffect):
             found, new["compression"] = of_contacts
             given = self._given_alpha(state, dt, substeps)
             new["contact_alpha"] = found if given is None else given
+            new["contact_substeps"] = state.groups.spread(substeps)
         of_step = MechanicsReport(**vars(report), substeps=substeps)
         return state.with_fields(**new).replace(
             position=x, axis=axes, length=lengths,
@@ -196,6 +204,8 @@ class BoundMechanics(BoundEffect):
         surfaces, walls = self._surfaces(state)
         given = [value for value in vars(self._given(state, 0.0)).values()]
         given += [value for _, value in walls] + [x for s in surfaces for x in _tensors(s)]
+        bonds = self._bonds(state, state.length)
+        given += [] if bonds is None else [bonds.levels]
         if has_tangent(*(x for x in given if isinstance(x, Tensor))):
             raise checks.InputError(
                 "Mechanics: contacts have a backward pass and no forward mode. Use backward(), or"
@@ -243,7 +253,7 @@ class BoundMechanics(BoundEffect):
             values.viscosity.of_cells(state), values.length_drag.of_cells(state),
             fields.get("drag"), of_cells(values.alpha), of_cells(values.stiffness),
             state.colony_id, surfaces, walls,
-            self._bonds(state, (state.length - elongation).detach()),
+            self._bonds(state, (state.length - elongation).detach()), self._drift(state),
         )  # fmt: skip
 
     def _bonds(self, state: State, base: Tensor) -> Bonds | None:
@@ -253,16 +263,25 @@ class BoundMechanics(BoundEffect):
             return None
         strengths = [self.values[f"adhesion[{k}].strength"] for k in range(len(kinds))]
         levels = levels_of(kinds, [x.of_cells(state) for x in strengths], state.fields, state.cells)
-        return Bonds(levels, tuple(kind.reach for kind in kinds), _begin(state, base))
+        return Bonds(
+            levels, tuple(kind.reach for kind in kinds), _begin(state, base, self._drift(state))
+        )
+
+    def _drift(self, state: State) -> Tensor | None:
+        """How far cells have moved and turned by themselves in this step, (N, d + turns)."""
+        return state.fields["drift"] if self.drifts else None
 
     def _bond_arrays(self, state: State, base: np.ndarray) -> tuple[np.ndarray, ...] | None:
-        bonds = self._bonds(state, torch.from_numpy(base))
-        if bonds is None:
+        """As `kernels.bonds` takes what is given."""
+        bonds, drift = self._bonds(state, torch.from_numpy(base)), self._drift(state)
+        if bonds is None and drift is None:
             return None
-        cells, numbers_of = bonds.begin, lambda x: as_array(x.contiguous(), torch.float64)
-        arrays = bonds.levels, cells.centre.T, cells.axis.T, cells.half
-        levels, position, axis, half = map(numbers_of, arrays)
-        return levels, np.array(bonds.reaches), position, axis, half
+        levels, reaches, own = compiled.NOTHING
+        if bonds is not None:
+            levels, reaches = as_array(bonds.levels, torch.float64), np.array(bonds.reaches)
+        if drift is not None:
+            own = as_array(drift, torch.float64)
+        return levels, reaches, own
 
     def _surfaces(self, state: State) -> tuple[list[Surface], list[tuple[str, Tensor | None]]]:
         """The surfaces of all walls; the kind of each, and its stiffness or weight, 0-dim or
@@ -278,9 +297,10 @@ class BoundMechanics(BoundEffect):
 
 
 @torch.no_grad()
-def _begin(state: State, base: Tensor) -> Capsules:
-    """The cells before they grew in this step and moved by themselves."""
-    position, axis, drift = state.position, state.axis, state.fields.get("drift")
+def _begin(state: State, base: Tensor, drift: Tensor | None) -> Capsules:
+    """The cells before they grew in this step and moved by themselves. base: (N,) µm, lengths
+    before growth."""
+    position, axis = state.position, state.axis
     if drift is not None:
         position = position - drift[:, : state.dim].to(position.dtype)
         axis = capsule.rotate(axis, -drift[:, state.dim :])

@@ -3,8 +3,9 @@ paper's equations 1–4)."""
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -32,7 +33,8 @@ from torchfilm.values import Rule, Value, checked, is_drawn, numbers, physical, 
 # The default length drag: free growth, but for bilateral contacts, which do not hold in it.
 LENGTH_DRAG = {"one-sided": 1e5, "bilateral": 10.0}
 CONTACTS = ("one-sided", "bilateral")
-STRENGTH = Rule("μ·µm²/h", least=0.0)
+OF_WALLS = {"stiffness": Rule("μ·µm/h", above=0.0), "weight": Rule(above=0.0, most=1.0)}
+OF_ADHESION = {"strength": Rule("μ·µm²/h", least=0.0)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,17 +129,15 @@ class Mechanics(Effect):
                 " it out, or leave out alpha, stiffness and contacts='bilateral'."
             )
         self.surfaces()  # raises for a wall that does not fit the dimension
-        self.physical_values()  # raises for a value of a wall that is not allowed
 
     def _check_parts(self, name: str, kind: type, rule: str) -> None:
         given = getattr(self, name)
         if isinstance(given, kind):
             hint = f"Write {name}=[{type(given).__name__}(…)]."
             raise checks.input_error(f"Mechanics.{name}", given, f"a list of {rule}", hint)
-        for part in given:
-            if not isinstance(part, kind):
-                raise checks.input_error(f"Mechanics.{name}", part, f"a list of {rule}")
-        object.__setattr__(self, name, tuple(given))
+        if not isinstance(given, Iterable) or not all(isinstance(part, kind) for part in given):
+            raise checks.input_error(f"Mechanics.{name}", given, f"a list of {rule}")
+        object.__setattr__(self, name, tuple(_checked(part) for part in given))
 
     def surfaces(self) -> list[Surface]:
         """What the walls are made of."""
@@ -182,17 +182,14 @@ class Mechanics(Effect):
 
     def physical_values(self) -> dict[str, tuple[Any, Rule]]:
         found = self.physical_fields()
-        for k, wall in enumerate(self.walls):
-            for name, rule in (
-                ("stiffness", Rule("μ·µm/h", above=0.0)),
-                ("weight", Rule(above=0.0, most=1.0)),
-            ):
-                if getattr(wall, name) is not None:
-                    label = f"{type(wall).__name__}.{name}"
-                    found[f"walls[{k}].{name}"] = (checked(label, getattr(wall, name), rule), rule)
-        for k, adhesion in enumerate(self.adhesion):
-            strength = checked("Adhesion.strength", adhesion.strength, STRENGTH)
-            found[f"adhesion[{k}].strength"] = strength, STRENGTH
+        parts: dict[str, Wall | Adhesion] = {
+            f"walls[{k}]": wall for k, wall in enumerate(self.walls)
+        }
+        parts |= {f"adhesion[{k}]": kind for k, kind in enumerate(self.adhesion)}
+        for place, part in parts.items():
+            for name, rule in _rules(part).items():
+                if (value := getattr(part, name)) is not None:
+                    found[f"{place}.{name}"] = value, rule
         return found
 
     def declares(self, dim: int) -> tuple[Field, ...]:
@@ -211,7 +208,9 @@ class Mechanics(Effect):
         alpha = Field("contact_alpha", meaning, "1/μ/µm", internal=True)
         meaning = "how much shorter pressure has made a cell than it once was"
         compression = Field("compression", meaning, "µm", at_division="reset", internal=True)
-        return move, collapsed, alpha, compression
+        meaning = "sub-steps in which the contacts of the last step were solved, 0 before the first"
+        steps = Field("contact_substeps", meaning, dtype=torch.int64, internal=True)
+        return move, collapsed, alpha, compression, steps
 
     @property
     def _own_fields(self) -> tuple[str, ...]:
@@ -225,7 +224,7 @@ class Mechanics(Effect):
 
     def reads(self) -> tuple[str, ...]:
         cells = ("position", "axis", "length", "radius", "elongation", "drag")
-        return (*cells, *(("drift",) if self.adhesion else ()), *self._own_fields)
+        return (*cells, "drift", *self._own_fields)
 
     def writes(self) -> tuple[str, ...]:
         return ("position", "axis", "length", "elongation", *self._own_fields)
@@ -415,10 +414,25 @@ class Mechanics(Effect):
         return PENALTY if self.alpha is None else smallest(self.alpha) * smallest(self.length_drag)
 
 
+def _rules(part: Wall | Adhesion) -> Mapping[str, Rule]:
+    return OF_ADHESION if isinstance(part, Adhesion) else OF_WALLS
+
+
+def _checked(part: Any) -> Any:
+    """A wall or a kind of adhesion with its values as an effect keeps them."""
+    own = copy.copy(part)
+    for name, rule in _rules(part).items():
+        if (given := getattr(part, name)) is not None:
+            label = f"{type(part).__name__}.{name}"
+            object.__setattr__(own, name, checked(label, given, rule))
+    return own
+
+
 def _of_adhesion(kind: Adhesion) -> str:
     """An adhesion in words, for `explain`."""
     strength = kind.strength
-    pull = "drawn" if is_drawn(strength) else f"{number_range(numbers(strength))} μ·µm²/h"
+    pull = f"{number_range(numbers(strength))} μ·µm²/h"
+    pull = "a strength drawn for each cell" if is_drawn(strength) else f"up to {pull}"
     levels = " and ".join(kind.levels)
     by = f", in proportion to {levels} of both cells" if levels else ""
-    return f"adhesion: a pull of up to {pull} at a gap of {kind.reach:g} µm{by}"
+    return f"adhesion: a pull of {pull} at a gap of {kind.reach:g} µm{by}"

@@ -11,7 +11,10 @@ from torchfilm.physics.contact_records import ContactReport
 from torchfilm.physics.problem import BAD_DRAG, COLLAPSED, STATUS, TOO_FAST
 
 # What may help, by status; SOLVE for the others.
-SOLVE = "A smaller dt, a larger alpha or more max_iterations may help"
+SOLVE = (
+    "A smaller dt, a larger alpha or more max_iterations may help; and where cells stick together,"
+    " a smaller strength, or lower levels of what multiplies it in both cells"
+)
 HINTS = {
     BAD_DRAG: "Check the effect or rule that sets the field drag",
     COLLAPSED: (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -16,20 +17,26 @@ from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.random import fine_uniform
 from torchfilm.tools.row_checks import check_variable
+from torchfilm.tools.vectors import safe_sqrt
+from torchfilm.tools.warn_once import warn
 from torchfilm.values import Value, numbers, physical
 
-# The farthest, in radii, that a cell may move in a step beside others: two of them come no closer,
-# or farther apart, than the margin in which contacts are looked for.
+# How far, in radii, a cell beside others may move in a step, and its ends by a usual turn, of one
+# standard deviation. Two that meet then lie no deeper in each other than contacts can part; to pass
+# through each other they would have to turn by seven standard deviations.
 FARTHEST = 0.3
-# rad: the standard deviation of a turn in a step.
-WIDEST_TURN = 0.1
+# rad: the widest usual turn in a step, of short cells and of cells without contacts.
+WIDEST_TURN = 0.2
+# Reversals in a step beyond which cells are said to spread too far: by 2 % there.
+OFTEN = 0.25
+ROUNDING = 1e-5
 
 
 @dataclass(frozen=True)
 class MotilityReport:
     """Made only where a cell would move too far to meet others, or by no number: `status` (B,), 1
     for its colony, in which no cell moved, and the `uid` (B,) and `move` (B,) µm of the first such
-    cell."""
+    cell, or of its ends by a usual turn."""
 
     status: Tensor
     uid: Tensor
@@ -39,8 +46,8 @@ class MotilityReport:
     def reason(self, place: int) -> str:
         """What went wrong in the colony at this place of the batch."""
         return (
-            f"cell {int(self.uid[place])} would move {float(self.move[place]):.3g} µm in one step;"
-            f" at most {FARTHEST:g} of its radius lets it meet others"
+            f"cell {int(self.uid[place])} would move {float(self.move[place]):.3g} µm in one step,"
+            f" by its speed or by turning; beside others it may move {FARTHEST:g} of its radius"
         )
 
 
@@ -60,7 +67,10 @@ class Motility(Effect):
     is drawn for the first cells, and daughters keep their mother's. A cell that pushes others has
     the force viscosity · (l + 2r) · speed, μ·µm²/h.
 
-    A colony fails where a cell beside others would move farther than half its radius in a step.
+    With Mechanics, a cell may move by 0.3 of its radius in a step, and so may its ends by a turn of
+    one standard deviation, (2 · turning · dt)^½ · l/2; such a turn may be 0.2 rad. Raises
+    InputError for a dt with which the first cells would move farther; a colony that comes to it
+    later fails.
     """
 
     speed: Value = physical(unit="µm/h", least=0.0, scheduled=True)
@@ -101,13 +111,15 @@ class Motility(Effect):
         return self.needs()
 
     def reads(self) -> tuple[str, ...]:
-        return ("position", "axis", "radius", "heading")
+        return ("position", "axis", "length", "radius", "heading")
 
     def writes(self) -> tuple[str, ...]:
         turns = ("axis",) if self.turning is not None else ()
         return ("position", "drift", *turns, *(("heading",) if self.reversals is not None else ()))
 
     def check(self, state: State, values: Values) -> None:
+        if bool((state.heading.abs() != 1).any()):
+            raise checks.InputError("Motility: heading of a first cell is neither 1 nor −1.")
         for option in ("factor", "reversal_factor"):
             if (name := getattr(self, option)) is not None:
                 check_variable(f"Motility.{option}", name, state, at_least_zero=True)
@@ -115,15 +127,17 @@ class Motility(Effect):
     def check_step(self, dt: float, divides: bool) -> None:
         given = {name: value for name, (value, _) in self.physical_values().items()}
         warn_of_steps("Motility", given, dt)
-        most = WIDEST_TURN**2 / (2.0 * dt)
-        times = each_value(self.turning) if self.turning is not None else ()
-        widest = max((float(numbers(x).max()) for x in times), default=0.0)
-        if widest > most:
-            raise checks.input_error(
-                "Motility.turning", widest,
-                f"at most {most:.3g} rad²/h in steps of {dt:g} h: cells would turn too far in one",
-                "Take a smaller dt.",
-            )  # fmt: skip
+        if self.reversals is None or self.reversal_factor is not None:
+            return
+        most = max(float(numbers(x).max()) for x in each_value(self.reversals))
+        if OFTEN < most * dt < math.inf:
+            x = most * dt
+            warn(
+                f"Motility.reversals = {most:g} in steps of {dt:g} h: a cell reverses up to {x:.3g}"
+                f" times in a step, but moves one way in it, so that its mean squared displacement"
+                f" is {x / math.tanh(x):.3g} times what it should be. Take a dt of at most"
+                f" {OFTEN / most:.2g} h."
+            )
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         return (BoundMotility(self, binding),)
@@ -134,7 +148,7 @@ class Motility(Effect):
     def numerics(self, dt: float, state: State) -> list[str]:
         lines = ["before contacts, which part those that meet"]
         if self.reversals is not None:
-            lines.append("reversals: by a draw of (1 − exp(−2·rate·dt))/2, exact at any dt")
+            lines.append("reversals: by a draw of (1 − exp(−2·rate·dt))/2 at the start of a step")
         if self.turning is not None:
             lines.append("turning: by a normal draw of the angle, of variance 2·turning·dt")
         return lines
@@ -146,28 +160,66 @@ class BoundMotility(BoundEffect):
     effect: Motility
     meets = False  # whether contacts part cells
 
+    # of the first cells: speed, 1/h, and usual turn, 1/h^½, of the ends, both in radii; rad/h^½
+    fastest = widest_end = widest = 0.0
+
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         self.meets = any(e.title == "mechanics" for e in effects)
+
+    def check(self, state: State) -> None:
+        super().check(state)
+        if state.cells:
+            turn = self._turn(state).detach()
+            self.fastest = float((self._speed(state).detach() / state.radius).max())
+            self.widest_end = float((0.5 * turn * state.length / state.radius).max())
+            self.widest = float(turn.max())
+
+    def check_step(self, dt: float, divides: bool) -> None:
+        """Also raise InputError where the first cells would move too far in a step."""
+        super().check_step(dt, divides)
+        root, limits = math.sqrt(dt), []
+        if self.meets:
+            limits.append(("speed", 1, self.fastest * dt, FARTHEST, "move by {} radii"))
+            limits.append(
+                ("turning", 2, self.widest_end * root, FARTHEST, "move its ends by {} radii")
+            )
+        limits.append(("turning", 2, self.widest * root, WIDEST_TURN, "turn by {} rad"))
+        for name, power, found, most, what in limits:
+            if found > most * (1.0 + ROUNDING):
+                longest = dt * (most / found) ** power
+                raise checks.InputError(
+                    f"Motility.{name}: in a step of {dt:g} h a first cell would"
+                    f" {what.format(f'{found:.3g}')}; at most {most:g} let contacts find whom it"
+                    f" meets. Take a dt of at most {0.99 * longest:.2g} h."
+                )
+
+    def _speed(self, state: State) -> Tensor:
+        """Of each cell, µm/h, (N,)."""
+        speed = self.values.speed.of_cells(state).expand(state.cells)
+        factor = self.effect.factor
+        return speed if factor is None else speed * state.fields[factor]
+
+    def _turn(self, state: State) -> Tensor:
+        """The standard deviation of each cell's turn over the root of the time, rad/h^½, (N,)."""
+        if self.effect.turning is None:
+            return torch.zeros_like(state.length)
+        return safe_sqrt(2.0 * self.values.turning.of_cells(state)).expand(state.cells)
 
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0:
             return state
-        effect, values = self.effect, self.values
+        effect = self.effect
         rows = torch.arange(state.cells, device=state.device)
-        heading, axis = state.heading, state.axis
+        heading, axis = state.heading.sign(), state.axis  # whatever a rule has made of it
         turn = axis.new_zeros(state.cells, 1 if state.dim == 2 else 3)
         if effect.reversals is not None:
             heading = torch.where(self._reverses(state, rows, dt), -heading, heading)
         if effect.turning is not None:
-            width = (2.0 * dt * values.turning.of_cells(state)).sqrt()
             turn = state.normal(rows, "Motility turning")[:, : turn.shape[1]]
-            turn = turn * width.expand(state.cells).unsqueeze(1)
+            turn = turn * (self._turn(state) * math.sqrt(dt)).unsqueeze(1)
             if state.dim == 3:  # without the part about the axis itself
                 turn = turn - (turn * axis).sum(1, keepdim=True) * axis
-        move = (values.speed.of_cells(state) * dt).expand(state.cells)
-        if effect.factor is not None:
-            move = move * state.fields[effect.factor]
-        state, move, turn = self._checked(state, move, turn)
+        state, move, turn = self._checked(state, self._speed(state) * dt, turn, dt)
         turned = capsule.rotate(axis, turn) if effect.turning is not None else axis
         way = (move * heading).unsqueeze(1) * turned
         made = {"heading": heading} if effect.reversals is not None else {}
@@ -184,11 +236,15 @@ class BoundMotility(BoundEffect):
         coarse, fine = (state.uniform(rows, f"Motility reversals {k}") for k in range(2))
         return fine_uniform(coarse, fine) < chance
 
-    def _checked(self, state: State, move: Tensor, turn: Tensor) -> tuple[State, Tensor, Tensor]:
-        """The moves (N,) and turns, 0 in colonies in which a move is too far, and the state that
-        says so."""
-        size = move.detach().abs()
-        good = size <= FARTHEST * state.radius.detach() if self.meets else size < torch.inf
+    def _checked(
+        self, state: State, move: Tensor, turn: Tensor, dt: float
+    ) -> tuple[State, Tensor, Tensor]:
+        """The moves (N,) and turns, 0 in colonies in which one is too far, and the state that says
+        so."""
+        usual = 0.5 * state.length * self._turn(state) * math.sqrt(dt)
+        size = torch.maximum(move.detach().abs(), usual.detach())
+        most = FARTHEST * (1.0 + ROUNDING) * state.radius.detach()
+        good = size <= most if self.meets else size < torch.inf
         if bool(good.all()):
             return state, move, turn
         at, bad = state.groups.first(~good)

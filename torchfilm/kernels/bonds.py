@@ -1,7 +1,10 @@
-"""Rows that pull: of cells that stick together, see `physics.adhesion`.
+"""Cells that move by themselves, and rows that pull: of cells that stick together, see
+`physics.adhesion`.
 
-bonds: levels (n, 2 K), reaches (K,), and where the cells are as the step begins: position (n, d),
-axis (n, d) and half length (n,). All are float64.
+given: levels (N, 2 K), reaches (K,), and how far the cells have moved and turned by themselves in
+this step, (N, d + turns); of no cells where there is none of it.
+bonds: levels (n, 2 K) and reaches (K,), and where the cells are as the step begins: position
+(n, d), axis (n, d) and half length (n,). All are float64.
 """
 
 from __future__ import annotations
@@ -10,31 +13,76 @@ import math
 
 import numpy as np
 
+from torchfilm.kernels.batch import put
 from torchfilm.kernels.capsules import closest_points
 from torchfilm.kernels.compiling import kernel, lean
 from torchfilm.kernels.memory import room
-from torchfilm.kernels.rows import HARD, STIFF
+from torchfilm.kernels.moves import rotate
+from torchfilm.kernels.rows import HARD, STIFF, degrees
 
 
 @kernel
-def bonds_of(memory, of, dt, bonds, dof):
-    """Of the cells `of`, in sub-steps of dt hours: with levels of stiffness · dt."""
-    levels, reaches, x, axis, half = bonds
-    n, d = of.shape[0], 2 if len(dof) == 4 else 3
-    n = n if reaches.shape[0] else 0
-    own, own_half = room(memory, (n, levels.shape[1]), np.float64), room(memory, (n,), np.float64)
-    own_x, own_axis = room(memory, (n, d), np.float64), room(memory, (n, d), np.float64)
-    for i in range(n):
-        own_half[i] = half[of[i]]
-        for k in range(d):
-            own_x[i, k], own_axis[i, k] = x[of[i], k], axis[of[i], k]
-        for k in range(levels.shape[1]):
-            own[i, k] = levels[of[i], k] * math.sqrt(dt)
-    return own, reaches, own_x, own_axis, own_half
+def drift_of(memory, of, given):
+    """What the cells `of` have moved and turned by themselves, (n, d + turns), or (0, ·)."""
+    drift = given[2]
+    own = room(memory, (of.shape[0] if drift.shape[0] else 0, drift.shape[1]), np.float64)
+    for i in range(own.shape[0]):
+        for k in range(own.shape[1]):
+            own[i, k] = drift[of[i], k]
+    return own
 
 
 @lean
-def add_bonds(rows, first, end, radius, bonds, alpha, dof):
+def move_along(x, axis, drift, share, dof):
+    """Carry out this share of the drift, in place."""
+    d = 2 if len(dof) == 4 else 3
+    for i in range(drift.shape[0]):
+        for k in range(d):
+            x[i, k] += share * drift[i, k]
+        tx, ty, tz = share * drift[i, d], 0.0, 0.0
+        if d == 3:
+            ty, tz = share * drift[i, d + 1], share * drift[i, d + 2]
+        rotate(axis, i, tx, ty, tz, math.sqrt(tx * tx + ty * ty + tz * tz), dof)
+
+
+@lean
+def bonds_of(memory, of, dt, given, x, axis, length, drift, dof):
+    """The bonds of the cells `of`, with levels of stiffness · dt. x, axis: after the drift. length:
+    (n,) before growth."""
+    levels, reaches, _ = given
+    n = of.shape[0] if reaches.shape[0] else 0
+    own, half = room(memory, (n, levels.shape[1]), np.float64), room(memory, (n,), np.float64)
+    for i in range(n):
+        half[i] = 0.5 * length[i]
+        for k in range(levels.shape[1]):
+            own[i, k] = levels[of[i], k] * math.sqrt(dt)
+    begin_x = room(memory, (n, x.shape[1]), np.float64)
+    begin_axis = room(memory, (n, x.shape[1]), np.float64)
+    if n:
+        put(x, begin_x)
+        put(axis, begin_axis)
+        move_along(begin_x, begin_axis, drift, -1.0, dof)
+    return own, reaches, begin_x, begin_axis, half
+
+
+@lean
+def reach_of(bonds, drift, dof):
+    """The gap, µm, up to which cells may hold each other, also where they have drifted apart."""
+    reaches, half, most, way = bonds[1], bonds[4], 0.0, 0.0
+    d = 2 if len(dof) == 4 else 3
+    for k in range(reaches.shape[0]):
+        most = max(most, reaches[k])
+    for i in range(drift.shape[0] if reaches.shape[0] else 0):
+        move, turn = 0.0, 0.0
+        for k in range(drift.shape[1]):
+            move += drift[i, k] * drift[i, k] if k < d else 0.0
+            turn += drift[i, k] * drift[i, k] if k >= d else 0.0
+        way = max(way, math.sqrt(move) + half[i] * math.sqrt(turn))
+    return most + 2.0 * way
+
+
+@lean
+def add_bonds(rows, first, end, x, axis, half, radius, scale, bonds, alpha, dof):
     """Adds rows that pull, after the `end` rows of which those of pairs begin at `first`: one for
     each row at a contact whose cells stick together. Returns how many rows there are. alpha,
     radius: (n,)."""
@@ -44,7 +92,8 @@ def add_bonds(rows, first, end, radius, bonds, alpha, dof):
         if kind[r] != HARD:
             continue
         i, j = one[r], two[r]
-        stiffness = _stiffness(bonds, i, j, radius[i] + radius[j], dof)
+        gap = _gap_at_begin(H, gaps, r, i, j, x, axis, half, scale, bonds, dof)
+        stiffness = _stiffness(bonds, i, j, radius[i] + radius[j], gap, dof)
         if stiffness == 0.0:
             continue
         root = math.sqrt(stiffness * 0.5 * (alpha[i] + alpha[j]))
@@ -56,8 +105,38 @@ def add_bonds(rows, first, end, radius, bonds, alpha, dof):
 
 
 @lean
-def _stiffness(bonds, i, j, touching, dof):
-    """Of the pair of cells i and j, whose radii are `touching`."""
+def _gap_at_begin(H, gaps, r, i, j, x, axis, half, scale, bonds, dof):
+    """The gap of row r as the step began, µm, to first order in what has moved since."""
+    d, weight, gap = 2 if len(dof) == 4 else 3, 0.0, gaps[r]
+    for k in range(d):
+        weight += (H[2 * r, k] / scale[i, k]) ** 2
+    gap += _opened(H, 2 * r, i, x, axis, half, scale, bonds, dof)
+    gap += _opened(H, 2 * r + 1, j, x, axis, half, scale, bonds, dof)
+    return gap / math.sqrt(weight)
+
+
+@lean
+def _opened(H, h, i, x, axis, half, scale, bonds, dof):
+    """How much one half of a row has closed its gap since the step began."""
+    _, _, begin_x, begin_axis, begin_half = bonds
+    d, last = 2 if len(dof) == 4 else 3, degrees(dof) - 1
+    ax, ay, bx, by = begin_axis[i, 0], begin_axis[i, 1], axis[i, 0], axis[i, 1]
+    change = H[h, d + (0 if d == 2 else 2)] / scale[i, d] * (ax * by - ay * bx)
+    if d == 3:
+        az, bz = begin_axis[i, 2], axis[i, 2]
+        change += H[h, d] / scale[i, d] * (ay * bz - az * by)
+        change += H[h, d + 1] / scale[i, d] * (az * bx - ax * bz)
+    for k in range(d):
+        change += H[h, k] / scale[i, k] * (x[i, k] - begin_x[i, k])
+    if scale[i, last] > 0:
+        change += H[h, last] / scale[i, last] * 2.0 * (half[i] - begin_half[i])
+    return change
+
+
+@lean
+def _stiffness(bonds, i, j, touching, gap, dof):
+    """Of the pair of cells i and j, whose radii are `touching`, in a row with this gap; both gaps
+    as the step began."""
     levels, reaches, x, axis, half = bonds
     bz, az, cz = 0.0, 0.0, 0.0
     if len(dof) == 8:
@@ -66,9 +145,9 @@ def _stiffness(bonds, i, j, touching, dof):
         x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], bz, axis[i, 0], axis[i, 1], az,
         axis[j, 0], axis[j, 1], cz, half[i], half[j], dof,
     )  # fmt: skip
-    gap, stiffness = math.sqrt(square) - touching, 0.0
+    widest, stiffness = max(gap, math.sqrt(square) - touching), 0.0
     for k in range(reaches.shape[0]):
-        if gap < reaches[k]:
+        if widest < reaches[k]:
             a, b = 2 * k, 2 * k + 1
             stiffness += levels[i, a] * levels[j, b] + levels[i, b] * levels[j, a]
     return stiffness

@@ -14,9 +14,9 @@ from torchfilm.kernels.compiling import index, lean
 from torchfilm.kernels.memory import copied, room, zeros
 
 FLAT, INSIDE, OUTSIDE = 0, 1, 2
-# Rows: of rigid contacts, of walls with a stiffness and of cells that stick together, of walls with
-# a weight below 1, and of two cells at
-# an end of the stretch along which they lie side by side.
+# Rows: of rigid contacts; of walls with a stiffness, and of cells that stick together; of walls
+# with a weight below 1; and of two cells at an end of the stretch along which they lie side by
+# side.
 HARD, STIFF, LIGHT, FAR = 0, 1, 2, 3
 
 

@@ -245,8 +245,8 @@ def second_cells(memory, H, one, two, rows):
 
 @lean
 def overlaps(gaps, rows):
-    """Whether one of the rows is of an overlap."""
+    """Whether one of the rows is of an overlap, or no number."""
     some = False
     for r in range(rows):
-        some |= gaps[r] < 0
+        some |= not (gaps[r] >= 0)
     return some

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from torchfilm.kernels.batch import put, put_back
-from torchfilm.kernels.bonds import add_bonds, bonds_of
+from torchfilm.kernels.bonds import add_bonds, bonds_of, drift_of, move_along, reach_of
 from torchfilm.kernels.colonies import (
     CLIPPED,
     DEEPLY,
@@ -187,20 +187,20 @@ def _prepared(memory, x, axis, growth, radius, drag, last, first_pass, rising, h
 
 @lean
 def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, hardness, walls,
-                alphas, bonds, settings, report, team, dof):  # fmt: skip
+                alphas, bonds, reach, settings, report, team, dof):  # fmt: skip
     """Grow one colony by `growth` and part what overlaps; x, axis, length, last, hardness in place.
 
     x, axis (n, d) float64. length to shortest: (n,). last: (n, D) the move from which to start.
     hardness: (1,) α. walls: kinds, places, sizes, which are soft, and (S, n) their D, or
-    stiffness · Δt. alphas: (n,), or (0,). bonds: see `kernels.bonds`.
+    stiffness · Δt. alphas: (n,), or (0,). bonds and their reach, µm: see `kernels.bonds`.
     """
     margin, target, deep, limits, passes = _of_colony(length, growth, radius, drag, settings)
-    tolerance, given, apart = settings[TOLERANCE], alphas.shape[0] > 0, _apart(margin, bonds)
+    tolerance, given, near = settings[TOLERANCE], alphas.shape[0] > 0, margin + reach
     hardness[0] = hardness[0] if hardness[0] > 0 else limits[0]
     arrays = _arrays(memory, length, growth, shortest, last, walls[4])
     half, y, kept = arrays[2], arrays[6], arrays[7]
     number, deeply, softer, rising, held, kept_alpha = 0, False, 1.0, True, 0.0, 0.0
-    found = found_contacts(memory, team, x, axis, half, radius, apart, dof)
+    found = found_contacts(memory, team, x, axis, half, radius, near, dof)
     report[DEEPLY] = 0 if settings[SOFT] > 0 else deeply_overlapping(memory, found, radius)
     top = memory[1][TOP]
     while number < passes:
@@ -212,7 +212,7 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
         if number > 0 and not deeply:  # cells do not lie deep in others; but in a wall?
             if deepest >= -deep:
                 break
-            found, deeply = found_contacts(memory, team, x, axis, half, radius, apart, dof), True
+            found, deeply = found_contacts(memory, team, x, axis, half, radius, near, dof), True
             top = memory[1][TOP]
             continue
         error, e, m = _solved(
@@ -247,7 +247,7 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
         if number < passes:
             give_back(memory, top)
             found, deeply = found_after(
-                memory, team, x, axis, radius, apart, deep, found, arrays, dof
+                memory, team, x, axis, radius, near, deep, found, arrays, dof
             )
             top = memory[1][TOP]
         if not deeply and walls[3].shape[0] == 0:
@@ -291,7 +291,7 @@ def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, number, a
     else:
         m = pair_rows(memory, x, axis, half, radius, scale, mine, walls, rows, far, dof)
     if bonds[1].shape[0]:
-        m = add_bonds(rows, walls, m, radius, bonds, alpha, dof)
+        m = add_bonds(rows, walls, m, x, axis, half, radius, scale, bonds, alpha, dof)
     error, e = _minimise_some(
         memory, rows, m, numbers, count, alpha, low, y, cap, settings, report, team, dof
     )
@@ -328,15 +328,6 @@ def _of_colony(base, growth, radius, drag, settings):
     passes = 1.0 if settings[SOFT] > 0 else settings[MOST_PASSES]
     limits = softest, hardest, max(PEAK * deep, PEAKED * target)
     return MARGIN * wide, target, deep, limits, passes
-
-
-@lean
-def _apart(margin, bonds):
-    """The gap, µm, up to which pairs have rows: those that push, and those that stick together."""
-    reaches, most = bonds[1], 0.0
-    for k in range(reaches.shape[0]):
-        most = max(most, reaches[k])
-    return margin + most
 
 
 @lean
@@ -380,11 +371,11 @@ def _mean(values):
 
 
 @lean(entry=True)
-def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, alphas, bonds,
+def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, alphas, given,
                   walls, settings, out, reports, dof):  # fmt: skip
     """Steps of the colonies `which`, each by itself: `kernels.colonies` describes the arguments.
-    team: a board of threads that assist, or (0,). bonds: as in `kernels.bonds`, of
-    N cells, or of none where none stick together."""
+    team: a board of threads that assist, or (0,). given: as in
+    `kernels.bonds`."""
     x, radius, contact_alpha = cells[0], cells[4], cells[7]
     kinds, places, sizes, _, is_soft = walls
     while True:
@@ -407,17 +398,23 @@ def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, 
             )
             shortest = shortest_of(memory, of, length, own_radius, cells)
             own_alphas = alphas_of(memory, of, dt / steps, alphas)
-            own_bonds = bonds_of(memory, of, dt / steps, bonds, dof)
+            drift = drift_of(memory, of, given)
+            bonds = bonds_of(memory, of, dt / steps, given, own_x, own_axis, length, drift, dof)
+            reach = reach_of(bonds, drift, dof)
             own_settings = copied(memory, settings, settings.shape[0])
             if steps > 1 and settings[DEEP] <= 0:
                 own_settings[DEEP] = DEEP_IN_SUBSTEPS * _mean(own_radius)
             top = memory[1][TOP]
+            if steps > 1:
+                move_along(own_x, own_axis, drift, -1.0, dof)
             for _ in range(steps):
                 give_back(memory, top)
+                if steps > 1:
+                    move_along(own_x, own_axis, drift, 1.0 / steps, dof)
                 step_colony(
                     memory, own_x, own_axis, length, share, own_radius, (mu, gamma), shortest, last,
                     hardness, (kinds, places[:, b], sizes[:, b], is_soft, roots), own_alphas,
-                    own_bonds, own_settings, report, team, dof,
+                    bonds, reach, own_settings, report, team, dof,
                 )  # fmt: skip
                 if report[STATUS] == NOT_FINITE:
                     break

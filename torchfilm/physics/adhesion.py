@@ -20,20 +20,22 @@ from torch import Tensor
 
 from torchfilm.physics.contacts import CandidateContacts, Capsules, Contacts
 from torchfilm.tools import checks
+from torchfilm.tools.ragged import Groups
 from torchfilm.tools.reads import rows_where
-from torchfilm.tools.vectors import safe_sqrt
+from torchfilm.tools.vectors import cross, dot, safe_norm, safe_sqrt
 
 
 @dataclass(frozen=True)
 class Adhesion(metaclass=checks.KnownKeywords):
     """Cells stick together: `tf.Mechanics(adhesion=[tf.Adhesion(strength=100.0)])`.
 
-    strength: μ·µm²/h, the greatest pull between two cells, where they are about to part. (The drag
-    of a cell 4 µm long and 1 µm wide that moves at v µm/h is 5 μm·μ·v.) One number, one per colony,
-    one per cell type, or a distribution drawn at birth. Where two cells differ, the pair has the
-    geometric mean: a cell of strength 0 sticks to none. reach: µm, the gap between surfaces at
-    which a pair parts. The pull is in proportion to the gap: cells that touch are not pulled, and
-    may slide along each other.
+    strength: μ·µm²/h, the greatest pull between two cells, where they are about to part. (A cell
+    with a centreline of 4 µm, 1 µm wide, that moves at v µm/h has a drag of μ · 5 µm · v.) One
+    number, one per colony, one per cell type, or a distribution drawn at birth. Where two cells
+    differ, the pair has the geometric mean: a cell of strength 0 sticks to none. reach: µm, at most
+    5, the gap between surfaces at which a pair parts; cells between the two do not matter. The pull
+    is in proportion to the gap: cells that touch are not pulled, and may slide along each other.
+    Nearly parallel cells hold on at two places, each with half of the strength.
 
     adhesin: name of a species of a circuit, or of a variable of rules, that makes cells stick: the
     pull is in proportion to the levels in both. partner: name of another one, to which the adhesin
@@ -93,20 +95,44 @@ class Bonds:
         """The same with stiffness · dt; dt: (N,) h, alike in a colony."""
         return replace(self, levels=self.levels * dt.to(self.levels.dtype).sqrt().unsqueeze(1))
 
-    @property
-    def apart(self) -> float:
-        """Gap, µm, up to which pairs may hold each other."""
-        return max(self.reaches)
-
-    def stiffness(self, first: Tensor, second: Tensor) -> Tensor:
-        """Of pairs of cells, (P,)."""
+    def stiffness(self, first: Tensor, second: Tensor, gap: Tensor) -> Tensor:
+        """Of pairs of cells, (P,), in rows with these gaps as the step begins."""
         a, b = self.levels.index_select(0, first), self.levels.index_select(0, second)
         pairs = a[:, 0::2] * b[:, 1::2] + a[:, 1::2] * b[:, 0::2]
         with torch.no_grad():
-            gap = CandidateContacts.all_of(self.begin, first, second).gap
-        near = [gap < reach for reach in self.reaches]
+            nearest = CandidateContacts.all_of(self.begin, first, second).gap
+            widest = torch.maximum(nearest, gap)
+        near = [widest < reach for reach in self.reaches]
         held = (torch.where(x, p, 0.0) for x, p in zip(near, pairs.unbind(1), strict=True))
         return functools.reduce(torch.add, held)  # in this order, whatever the batch
+
+    @torch.no_grad()
+    def apart(self, drift: Tensor | None, groups: Groups) -> Tensor:
+        """The gap, µm, up to which pairs of each colony may hold each other, (B,), also where they
+        have drifted apart."""
+        reach = self.levels.new_full((groups.size,), max(self.reaches))
+        if drift is None:
+            return reach
+        dim = self.begin.centre.shape[0]
+        move, turn = (safe_norm(x.T.double()) for x in (drift[:, :dim], drift[:, dim:]))
+        return reach + 2.0 * groups.max(move + self.begin.half * turn)
+
+
+@torch.no_grad()
+def _gap_at_begin(contacts: Contacts, now: Capsules, begin: Capsules) -> Tensor:
+    """The gap of each row as the step began, (K,) µm, to first order in what has moved since."""
+    moved = torch.cat([
+        now.centre - begin.centre, cross(begin.axis, now.axis),
+        2.0 * (now.half - begin.half).unsqueeze(0),
+    ])  # fmt: skip
+    closed = (
+        dot(row.T, moved.index_select(1, cell))
+        for row, cell in (
+            (contacts.row_first, contacts.first),
+            (contacts.row_second, contacts.second),
+        )
+    )
+    return contacts.gap + sum(closed)
 
 
 def levels_of(
@@ -125,11 +151,13 @@ def levels_of(
     return torch.stack(levels, 1)
 
 
-def with_bonds(contacts: Contacts, bonds: Bonds) -> Contacts:
-    """The rows of contacts, and after them those that pull: one for each row at a contact."""
-    assert contacts.far is not None
-    stiffness = bonds.stiffness(contacts.first, contacts.second)
-    (held,) = rows_where((stiffness.detach() != 0) & ~contacts.far)
+def with_bonds(contacts: Contacts, bonds: Bonds, now: Capsules) -> Contacts:
+    """The rows of contacts, and after them those that pull: one for each row at a contact. now:
+    (N,) the cells."""
+    assert contacts.beside is not None
+    gap = _gap_at_begin(contacts, now, bonds.begin)
+    stiffness = bonds.stiffness(contacts.first, contacts.second, gap)
+    (held,) = rows_where((stiffness.detach() != 0) & ~contacts.beside)
     pick = lambda x: x.index_select(0, held)
     both = lambda x, sign=1: torch.cat([x, sign * pick(x)])
     return replace(
@@ -138,6 +166,17 @@ def with_bonds(contacts: Contacts, bonds: Bonds) -> Contacts:
         gap=both(contacts.gap, -1), row_first=both(contacts.row_first, -1),
         row_second=both(contacts.row_second, -1),
         normal=torch.cat([contacts.normal, -contacts.normal.index_select(1, held)], 1),
-        far=torch.cat([contacts.far, torch.ones_like(pick(contacts.far))]),
+        beside=torch.cat([contacts.beside, torch.ones_like(pick(contacts.beside))]),
         pull=torch.cat([torch.zeros_like(stiffness), pick(stiffness)]),
     )  # fmt: skip
+
+
+def roots_of(contacts: Contacts, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """D of each row of two cells, (K, 1), and whether it pulls, (K,) bool. alpha: (N,)."""
+    root, pull = contacts.weight.sqrt(), contacts.pull
+    if pull is None:
+        return root.unsqueeze(1), torch.zeros_like(contacts.first, dtype=torch.bool)
+    pulls = pull.detach() != 0
+    first, second = (alpha.index_select(0, x) for x in (contacts.first, contacts.second))
+    held = safe_sqrt(0.5 * pull * (first + second)) + 0.0 * pull  # also what is not a number
+    return torch.where(pulls, root * held, root).unsqueeze(1), pulls

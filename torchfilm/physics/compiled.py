@@ -28,8 +28,8 @@ CELLS_A_THREAD = 1000
 # A tuple as long as rows have columns: seven in space, and the last column stays 0.
 DEGREES = {2: (0,) * 4, 3: (0,) * 8}
 
-# of cells that do not stick together
-NO_BONDS = np.empty((0, 0)), np.empty(0), np.empty((0, 0)), np.empty((0, 0)), np.empty(0)
+# of cells that neither stick together nor move by themselves
+NOTHING = np.empty((0, 0)), np.empty(0), np.empty((0, 0))
 
 # which kernels this process has called: type of settings, dimension, type of numbers
 _called: set[tuple[type, int, np.dtype]] = set()
@@ -38,10 +38,10 @@ _called: set[tuple[type, int, np.dtype]] = set()
 def step(
     settings: OneSidedSettings | ContactSettings, groups: Groups, dt: float, longest: float,
     cells: tuple[np.ndarray, ...], drags: tuple[np.ndarray, ...], alphas: tuple[int, np.ndarray],
-    walls: tuple[np.ndarray, ...], bonds: tuple[np.ndarray, ...] | None = None,
+    walls: tuple[np.ndarray, ...], given: tuple[np.ndarray, ...] | None = None,
 ) -> tuple[tuple[np.ndarray, ...], ContactReport, Tensor]:  # fmt: skip
     """As `torch_step.step`, from arrays to arrays: see `kernels.colonies`. Returns what the cells
-    in the groups become, the report, and the sub-steps of each colony. bonds: see
+    in the groups become, the report, and the sub-steps of each colony. given: see
     `kernels.bonds`."""
     from torchfilm.kernels import colonies as kernels
 
@@ -56,7 +56,7 @@ def step(
     one_sided = isinstance(settings, OneSidedSettings)
     arguments = (
         groups.begin.numpy(), float(dt), float(longest), cells, drags, alphas,
-        *([bonds or NO_BONDS] if one_sided else []), walls, numbers, out, reports, degrees,
+        *([given or NOTHING] if one_sided else []), walls, numbers, out, reports, degrees,
     )  # fmt: skip
     counts, every = groups.counts.numpy(), np.arange(groups.size)
     with nullcontext() if kind in _called else _first_call(*kind):

@@ -52,10 +52,10 @@ class Contacts:
 
     first, second: (K,) the cells. gap: (K,) µm. weight: D², (K,). `row_first`, `row_second`: (K, 4)
     in 2-D [n, q×n, ∂] and (K, 7) in 3-D. The gap after moves x is gap − row_first·x_first −
-    row_second·x_second. `normal`: (d, K) from first to second. far: (K,) bool, rows of one-sided
-    contacts at the ends of stretches, not at the contact, and those that pull; None if there are
-    none. pull: (K,) stiffness · Δt of rows that pull (see `adhesion`), 0 of others; None if there
-    are none.
+    row_second·x_second. `normal`: (d, K) from first to second. beside: (K,) bool, rows of
+    one-sided contacts that do not count for α: at the ends of stretches, not at the contact, and
+    those that pull; None if there are none. pull: (K,) stiffness · Δt of rows that pull (see
+    `adhesion`), 0 of others; None if there are none.
     """
 
     first: Tensor
@@ -65,7 +65,7 @@ class Contacts:
     row_first: Tensor
     row_second: Tensor
     normal: Tensor
-    far: Tensor | None = None
+    beside: Tensor | None = None
     pull: Tensor | None = None
 
 

@@ -28,9 +28,9 @@ from torchfilm.kernels.scheme import (
     UNMOVED,
 )
 from torchfilm.physics import capsule
-from torchfilm.physics.adhesion import with_bonds
+from torchfilm.physics.adhesion import roots_of, with_bonds
 from torchfilm.physics.adjoint import attach_gradient
-from torchfilm.physics.contacts import CandidateContacts, Capsules, Contacts
+from torchfilm.physics.contacts import CandidateContacts, Capsules
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.near_rows import near_rows
 from torchfilm.physics.neighbours import Neighbourhood
@@ -47,7 +47,7 @@ from torchfilm.physics.wall_contacts import (
 )
 from torchfilm.tools.ragged import marked
 from torchfilm.tools.reads import numbers, rows_where
-from torchfilm.tools.vectors import nearest_root, safe_norm, safe_sqrt
+from torchfilm.tools.vectors import nearest_root, safe_norm
 
 
 def contact_steps(given: StepInput) -> StepResult:
@@ -59,9 +59,27 @@ def contact_steps(given: StepInput) -> StepResult:
         none, none, torch.zeros_like(given.hardness), none, none, none,
     )  # fmt: skip
     growth = given.growth / steps.clamp(min=1).index_select(0, given.groups.owner)
+    if given.drift is not None:  # what cells have moved by themselves, in sub-steps as well
+        at = _drifted(at, given, torch.where(steps > 1, -1.0, 0.0))
     for k in range(int(steps.max()) if steps.numel() else 0):
+        if given.drift is not None:
+            at = _drifted(at, given, torch.where((steps > 1) & (k < steps), 1.0 / steps, 0.0))
         at = _OneStep(given, at.length, growth, (k < steps) & (at.status != NOT_FINITE)).taken(at)
     return at
+
+
+def _drifted(at: StepResult, given: StepInput, share: Tensor) -> StepResult:
+    """After this share (B,) of what the cells have moved and turned by themselves."""
+    assert given.drift is not None
+    own, dim = share.index_select(0, given.groups.owner).unsqueeze(1), given.settings.dim
+    some = own != 0
+    move = own * given.drift[:, :dim].to(at.position.dtype)
+    turned = capsule.rotate(at.axis, own.to(at.axis.dtype) * given.drift[:, dim:])
+    return replace(
+        at,
+        position=torch.where(some, at.position + move, at.position),
+        axis=torch.where(some, turned, at.axis),
+    )
 
 
 class _OneStep:
@@ -132,7 +150,10 @@ class _OneStep:
         local, axis = at.position - start.index_select(0, owner), at.axis.double()
         length, radius = at.length.double(), given.radius.double()
         margin = MARGIN * self.wide.index_select(0, owner)
-        apart = margin if given.bonds is None else margin + given.bonds.apart
+        apart = margin
+        if given.bonds is not None:
+            held = given.bonds.apart(given.drift, self.groups)
+            apart = margin + held.index_select(0, owner)
         pick = lambda x: x.detach().index_select(0, rows)
         near = Neighbourhood(
             pick(local), pick(axis), pick(length), pick(radius),
@@ -175,16 +196,6 @@ class _OneStep:
         limit = self.deep.index_select(0, owner.index_select(0, walls.cell))
         return mark | marked(count, walls.cell, hard & (walls.gap.detach() < -limit))
 
-    def _pair_roots(self, contacts: Contacts, alpha: Tensor) -> tuple[Tensor, Tensor]:
-        """D of each row of two cells, (K, 1), and whether it pulls, (K,) bool."""
-        root, pull = contacts.weight.sqrt(), contacts.pull
-        if pull is None:
-            return root.unsqueeze(1), torch.zeros_like(contacts.first, dtype=torch.bool)
-        pulls = pull.detach() != 0
-        first, second = (alpha.index_select(0, x) for x in (contacts.first, contacts.second))
-        held = safe_sqrt(0.5 * pull * (first + second)) + 0.0 * pull  # also what is not a number
-        return torch.where(pulls, root * held, root).unsqueeze(1), pulls
-
     def _wall_roots(self, walls: WallContacts, alpha: Tensor) -> tuple[Tensor, Tensor]:
         """D of each wall row (W,), and whether the wall is soft, (W,) bool."""
         root = torch.ones_like(walls.gap)
@@ -210,7 +221,10 @@ class _OneStep:
         margin = MARGIN * self.wide.index_select(0, owner)
         contacts = near_rows(pairs, None if settings.soft else margin)
         if given.bonds is not None:
-            contacts = with_bonds(contacts, given.bonds)
+            now = Capsules(
+                at.position.T, at.axis.double().T, 0.5 * at.length.double(), given.radius
+            )
+            contacts = with_bonds(contacts, given.bonds, now)
         solved = self._solved(at, contacts, walls, moving, cells, active, least, first_pass)
         part, end = solved.problem, solved.end
         y = self._with_gradient(part, end)
@@ -315,7 +329,7 @@ class _OneStep:
         length_drag = torch.where(rigid, torch.inf, given.length_drag)
         drag = [across] * settings.dim + [turning] * turns + [length_drag]
         scale = torch.stack(drag, 1).rsqrt()
-        root, pulls = self._pair_roots(contacts, alpha)
+        root, pulls = roots_of(contacts, alpha)
         wall_root, soft = self._wall_roots(walls, alpha)
         half = lambda row, cell: (row * scale.double().index_select(0, cell)).to(dtype)
         rows = ContactJacobian(
@@ -342,7 +356,7 @@ class _OneStep:
         harder at once, softer by a factor of two a step. Rows at the ends of stretches do not
         count."""
         root, soft = self._wall_roots(walls, torch.ones_like(self.given.radius))
-        hard = torch.cat([~contacts.far, ~soft & (root >= 1)])  # all: the first pass moves all
+        hard = torch.cat([~contacts.beside, ~soft & (root >= 1)])  # all: the first pass moves all
         overlap = torch.where(hard, -after, 0.0).clamp(min=0.0).double()
         most = torch.maximum(PEAK * self.deep, PEAKED * self.target)
         powers = overlap / most.index_select(0, problem.of_rows.owner)

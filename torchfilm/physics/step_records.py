@@ -29,7 +29,8 @@ class MechanicsInput(Generic[Settings]):
     contacts. viscosity, length_drag, and alpha or stiffness where one of them is given: 0-dim or
     (N,); drag (N,), a factor of viscosity, or None. colony_id (B,). walls: for each surface its
     kind ("hard", "stiffness", "weight") and that value, 0-dim or (N,). bonds: of cells that stick
-    together, or None.
+    together, or None. drift: (N, d + turns), how far they have moved and turned by themselves in
+    this step, or None.
     """
 
     settings: Settings
@@ -54,6 +55,7 @@ class MechanicsInput(Generic[Settings]):
     surfaces: Sequence[Surface]
     walls: Sequence[tuple[str, Tensor | None]]
     bonds: Bonds | None = None
+    drift: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,8 @@ class StepInput(Generic[Settings]):
     the start and for bilateral contacts; alpha (N,) where it is given, else None, and of bilateral
     contacts always; walls: for each surface its kind ("hard", "stiffness", "weight") and its
     weight, or its stiffness · Δt of the sub-step, (N,); shortest (N,) µm, of one-sided contacts: no
-    cell becomes shorter by pressure. bonds: with stiffness · Δt of the sub-step, or None.
+    cell becomes shorter by pressure. bonds: with stiffness · Δt of the sub-step, or None. drift:
+    see `MechanicsInput`.
     """
 
     settings: Settings
@@ -104,6 +107,7 @@ class StepInput(Generic[Settings]):
     walls: Sequence[tuple[str, Tensor | None]]
     shortest: Tensor
     bonds: Bonds | None
+    drift: Tensor | None
 
     @property
     def ids(self) -> Tensor:

@@ -69,7 +69,7 @@ def _contacts(
         given.radius, *drags, steps, given.move, hardness,
         None if alpha is None else alpha.expand(base.numel()),
         given.groups.spread(given.colony_id), given.surfaces, walls, shortest,
-        None if given.bonds is None else given.bonds.over(own_dt),
+        None if given.bonds is None else given.bonds.over(own_dt), given.drift,
     )  # fmt: skip
 
 

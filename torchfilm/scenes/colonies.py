@@ -81,6 +81,7 @@ def programmed_growth(
 
 def strain_sorting(
     strength: Value = 300.0,
+    reach: float = 0.2,
     speed: Value = 14.0,
     reversals: Value = 4.0,
     turning: Value = 0.4,
@@ -93,7 +94,7 @@ def strain_sorting(
     The plan is that of Glass and Riedel-Kruse 2018 (Cell 174, 649): adhesins on the surface of
     E. coli decide who sticks to whom. Cells do not grow. They move along their axis, at `speed`
     µm/h, reverse (`reversals`, 1/h) and turn (`turning`, rad²/h), in a round chamber of the radius
-    `chamber` µm. strength: of a bond between two cells of a strain, μ·µm²/h; 0: nothing sticks. A
+    `chamber` µm. strength, reach: of a bond between two cells of a strain, μ·µm²/h and µm. A
     cell 1.6 µm long moves with a force of 1.6 · speed. The constants are chosen here.
     """
     return Scene(
@@ -103,8 +104,8 @@ def strain_sorting(
             walls=[Sphere(center=(0.0, 0.0), radius=chamber)],
             length_drag=length_drag,
             adhesion=[
-                Adhesion(ByType({0: strength, 1: 0.0}), reach=0.2),
-                Adhesion(ByType({0: 0.0, 1: strength}), reach=0.2),
+                Adhesion(ByType({0: strength, 1: 0.0}), reach),
+                Adhesion(ByType({0: 0.0, 1: strength}), reach),
             ],
         ),
         founders=partial(_two_strains, cells, chamber),

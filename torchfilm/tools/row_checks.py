@@ -171,7 +171,8 @@ def check_variable(label: str, name: str, state: Any, at_least_zero: bool = Fals
     there, where so asked. label: the option by which it was named."""
     declared = state.declared.get(name)
     if declared is None or declared.scope != "cell" or declared.shape:
-        there = [n for n, f in state.declared.items() if f.scope == "cell" and not f.shape]
+        cells = {n: f for n, f in state.declared.items() if f.scope == "cell" and not f.shape}
+        there = [n for n, f in cells.items() if not f.internal]
         rule = "a species of a circuit, or a variable with one number for each cell"
         raise checks.input_error(label, name, rule, f"There are: {', '.join(there)}.")
     if at_least_zero and bool((~(state.fields[name] >= 0)).any()):
