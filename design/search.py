@@ -77,6 +77,7 @@ class Search(TaskOptions):
     _known: KnownDesigns | None = field(init=False, repr=False)
     _progress: SearchProgress = field(init=False, repr=False)
 
+    @checks.once()  # it binds the scene of many designs
     def __post_init__(self) -> None:
         task = Task.of(self)
         if not isinstance(self.finals, Finals | None):
@@ -118,6 +119,7 @@ class Search(TaskOptions):
         return f"{chosen.describe()} ({chosen.why})" if chosen and chosen.why else ""
 
     @checks.known_keywords
+    @checks.once()
     def run(
         self,
         colonies: int,

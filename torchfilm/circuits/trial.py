@@ -103,5 +103,6 @@ def _check_size(label: str, numbers: Sequence[Tensor], atol: float) -> None:
         warn(
             f"{label}: its species are of about {size:.0e}, and errors below Circuit.atol ="
             f" {atol:.0e} count as none. Give atol={1e-3 * SMALL * size:.0e}, or concentrations in"
-            " a smaller unit, such as nM in place of M."
+            " a smaller unit, such as nM in place of M.",
+            of=f"{label}: small species",
         )

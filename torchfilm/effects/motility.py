@@ -136,7 +136,8 @@ class Motility(Effect):
                 f"Motility.reversals = {most:g} in steps of {dt:g} h: a cell reverses up to {x:.3g}"
                 f" times in a step, but moves one way in it, so that its mean squared displacement"
                 f" is {x / math.tanh(x):.3g} times what it should be. Take a dt of at most"
-                f" {OFTEN / most:.2g} h."
+                f" {OFTEN / most:.2g} h.",
+                of="Motility.reversals",
             )
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:

@@ -16,6 +16,8 @@ from typing import Any, TypeVar, cast
 import torch
 from torch import Tensor
 
+from torchfilm.tools.warn_once import once as once  # public, for searches
+
 Number = float | int
 F = TypeVar("F", bound=Callable[..., Any])
 Value = float | Tensor | Sequence[float]

@@ -41,16 +41,17 @@ def quietly() -> Iterator[None]:
         _QUIET.reset(token)
 
 
-def warn(text: str, *, category: type[Warning] = UserWarning) -> None:
+def warn(text: str, *, category: type[Warning] = UserWarning, of: str | None = None) -> None:
     """Warn of what is probably a mistake, at the user's line, unless a surrounding `once` has said
-    so already."""
+    so already. of: what it is about, where its text has numbers that differ between the designs of
+    a search; by default it is known by its text."""
     if _QUIET.get():
         return
-    said = _SAID.get()
-    if said is None or text not in said:
+    said, known = _SAID.get(), text if of is None else of
+    if said is None or known not in said:
         warnings.warn(text, category, stacklevel=_users_level() + 1)
     if said is not None:
-        said.add(text)
+        said.add(known)
 
 
 def _users_level() -> int:
