@@ -191,11 +191,10 @@ def _warnings(report: SearchReport) -> list[str]:
         )
     if isinstance(target, Observed) and best.loss > FITS:
         lines.append(_poor_fit(target, best))
-    if report.first.loss < best.loss:
+    if not report.task.goals and report.first.loss < best.loss:
         lines.append(
-            "the first guess has a smaller loss than the best design, since the search ranked it"
-            " behind on fewer or smaller colonies. Give it more replicates or another method, and"
-            " start= with the first guess."
+            "the first guess has a smaller loss on the seeds of the search. If the search did not"
+            " grow it to full size, begin another one with it: start=."
         )
     if best.fresh is not None and best.loss < LUCKY * best.fresh.band[0]:
         lines.append(

@@ -290,6 +290,15 @@ def test_a_wall_may_be_softer_for_one_type_of_cells():
     assert float(found[0, 0]) == pytest.approx(10.0, rel=1e-3)
 
 
+def test_a_wall_may_weigh_less_for_one_type_of_cells():
+    for weight in ({0: 0.5, 1: 1.0}, {0: tf.Uniform(0.5, 0.6), 1: 1.0}, {0: [0.5, 0.7], 1: 1.0}):
+        wall = tf.Plane(y=-3.0, facing="+y", weight=weight)
+        cells = tf.Cells([[0, 0], [9, 0]], [[1, 0], [1, 0]], 2.0, cell_type=[0, 1])
+        scene = tf.Scene(tf.Mechanics(dim=2, walls=(w for w in [wall])), founders=cells)
+        (made,) = scene.effects[0].walls
+        assert made.yields and "1 with a stiffness or weight" in str(tf.explain(scene, colonies=2))
+
+
 def test_growth_rates_are_those_that_pressure_leaves():
     """A cell that is held between walls does not grow; a free one does at its rate; a cell that was
     born meanwhile has none."""

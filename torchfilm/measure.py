@@ -131,7 +131,7 @@ def _softness(measure: str, state: State, dt: float) -> Tensor:
     if steps is None or bool((steps < 1).any()):
         raise checks.InputError(
             f"{measure}: the state does not say in how many sub-steps its contacts were solved:"
-            " it is a first one, or from a file of an earlier version. Give it as a step made it."
+            " it is a first one. Give one that a step has made."
         )
     return state.contact_alpha.double() * dt / steps
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import Target
+from design.targets.base import WORST, Target
 from torchfilm import checks
 
 Measure = Callable[[tf.State], Tensor]
@@ -32,7 +32,7 @@ class Measured(Target):
     failed. For several processes, functions stand at the top level of a file.
     """
 
-    failed = FARTHEST**2
+    failed = WORST
     pattern = False
     functions: Mapping[str, Measure]
     wanted: Mapping[str, float | tuple[float, float]]
@@ -91,7 +91,8 @@ class Measured(Target):
         parts = []
         for name, found in zip(self.functions, self._found(state), strict=True):
             low, high = self.wanted[name]  # type: ignore[misc]
-            apart = (found - low).clamp(max=0.0) + (found - high).clamp(min=0.0)
+            beyond = torch.where(found > high, found - high, torch.where(found.isnan(), found, 0.0))
+            apart = torch.where(found < low, found - low, beyond)
             parts.append((apart / self.spread[name]).clamp(-FARTHEST, FARTHEST))
         return torch.stack(parts, 1) / math.sqrt(len(parts))
 

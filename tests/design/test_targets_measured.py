@@ -47,6 +47,8 @@ def test_the_loss_by_hand():
 
 def test_open_ranges_and_the_farthest():
     state = colonies([2.0], [0])
+    endless = Measured({"it": lambda s: s.counts / 0.0}, {"it": (0.0, math.inf)}, {"it": 1.0})
+    assert endless.loss(state).tolist() == [0.0]
     for wanted, loss in (((1.0, math.inf), 0.0), ((-math.inf, 1.0), 100.0), (1e9, 1e4)):
         target = Measured({"longest": longest}, {"longest": wanted}, {"longest": 0.1})
         assert target.loss(state).tolist() == pytest.approx([loss])

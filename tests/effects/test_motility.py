@@ -217,6 +217,16 @@ def test_what_becomes_too_fast_to_meet_others_fails_its_colony():
     assert state.counts.tolist() == [3, 0]
 
 
+def test_what_comes_to_turn_too_far_fails_too():
+    scene = tf.Scene(
+        tf.Motility(1.0, turning=tf.Schedule({0.0: 0.1, 0.02: 50.0})),
+        founders=far_apart(2),
+        dt=0.01,
+    )
+    with pytest.raises(SimulationError, match=r"by a turn of 1 rad.* turn by 0.2 rad"):
+        list(tf.simulate(scene, until=0.05))
+
+
 def test_the_most_that_is_allowed_runs_in_both_precisions():
     for dtype in (torch.float32, torch.float64):
         for speed, dt in ((3.0, 0.05), (6.0, 0.025)):
@@ -329,7 +339,7 @@ def test_gradients_pass_through_speed():
         ),
         (
             lambda: list(tf.simulate(in_a_row([20.0], 0.0), until=0.1)),
-            r"Motility.speed: in a step of 0.01 h a first cell would move by 0.4 radii.*0.0074 h",
+            r"Motility.speed: in a step of 0.01 h a first cell would move by 0.4 radii.*0.0075 h",
         ),
         (
             lambda: tf.Scene(

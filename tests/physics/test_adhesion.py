@@ -195,21 +195,25 @@ def test_it_moves_no_centre_of_mass_and_turns_no_colony(backend, dim):
     assert np.abs((arm + turning * move[:, dim:-1]).sum(0)).max() <= 1e-8
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_compiled_and_torch_agree(dim):
-    """A growing crowd in float64, to the tolerance of the solves, before decisions by last bits."""
+@pytest.mark.parametrize("dim, parts", [(2, 1), (3, 1), (2, 3), (3, 3)])
+def test_compiled_and_torch_agree(dim, parts):
+    """A growing, motile crowd in float64, to the tolerance of the solves, before decisions by last
+    bits; also in three sub-steps."""
     ends = []
     for backend in ("compiled", "torch"):
         scene = tf.Scene(
             growth(),
+            tf.Motility(5.0, reversals=1.0, turning=0.05),
             mechanics(
                 dim=dim, contacts="one-sided", tolerance=1e-8, backend=backend,
                 adhesion=[tf.Adhesion(100.0, reach=0.2)],
+                max_elongation=0.25 if parts == 1 else 0.01,
             ),
         )  # fmt: skip
         start = seeded(scene, crowd(np.random.default_rng(8), 50, dim), "cpu", torch.float64)
         ends.append(run(scene, start, 3, 0.01))
-    assert array((ends[0].position - ends[1].position).abs()).max() <= 1e-6
+    assert int(ends[0].contact_substeps.max()) == parts
+    assert array((ends[0].position - ends[1].position).abs()).max() <= 1e-9
 
 
 @BACKENDS

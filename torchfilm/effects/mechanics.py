@@ -135,9 +135,10 @@ class Mechanics(Effect):
         if isinstance(given, kind):
             hint = f"Write {name}=[{type(given).__name__}(…)]."
             raise checks.input_error(f"Mechanics.{name}", given, f"a list of {rule}", hint)
-        if not isinstance(given, Iterable) or not all(isinstance(part, kind) for part in given):
+        parts = tuple(given) if isinstance(given, Iterable) else (given,)
+        if not all(isinstance(part, kind) for part in parts):
             raise checks.input_error(f"Mechanics.{name}", given, f"a list of {rule}")
-        object.__setattr__(self, name, tuple(_checked(part) for part in given))
+        object.__setattr__(self, name, tuple(map(_checked, parts)))
 
     def surfaces(self) -> list[Surface]:
         """What the walls are made of."""

@@ -35,19 +35,21 @@ ROUNDING = 1e-5
 @dataclass(frozen=True)
 class MotilityReport:
     """Made only where a cell would move too far to meet others, or by no number: `status` (B,), 1
-    for its colony, in which no cell moved, and the `uid` (B,) and `move` (B,) µm of the first such
-    cell, or of its ends by a usual turn."""
+    for its colony, in which no cell moved. Of the first such cell: `uid` (B,), `move` (B,) µm, or
+    that of its ends by a usual turn, and that `turn` (B,) rad."""
 
     status: Tensor
     uid: Tensor
     move: Tensor
+    turn: Tensor
     hint = "A smaller dt or speed may help (speeds are per hour, and dt is in hours)"
 
     def reason(self, place: int) -> str:
         """What went wrong in the colony at this place of the batch."""
         return (
             f"cell {int(self.uid[place])} would move {float(self.move[place]):.3g} µm in one step,"
-            f" by its speed or by turning; beside others it may move {FARTHEST:g} of its radius"
+            f" by its speed or by a turn of {float(self.turn[place]):.2g} rad; beside others it may"
+            f" move {FARTHEST:g} of its radius, and turn by {WIDEST_TURN:g} rad"
         )
 
 
@@ -136,7 +138,7 @@ class Motility(Effect):
                 f"Motility.reversals = {most:g} in steps of {dt:g} h: a cell reverses up to {x:.3g}"
                 f" times in a step, but moves one way in it, so that its mean squared displacement"
                 f" is {x / math.tanh(x):.3g} times what it should be. Take a dt of at most"
-                f" {OFTEN / most:.2g} h.",
+                f" {_rounded_down(OFTEN / most)} h.",
                 of="Motility.reversals",
             )
 
@@ -191,7 +193,7 @@ class BoundMotility(BoundEffect):
                 raise checks.InputError(
                     f"Motility.{name}: in a step of {dt:g} h a first cell would"
                     f" {what.format(f'{found:.3g}')}; at most {most:g} let contacts find whom it"
-                    f" meets. Take a dt of at most {0.99 * longest:.2g} h."
+                    f" meets. Take a dt of at most {_rounded_down(longest)} h."
                 )
 
     def _speed(self, state: State) -> Tensor:
@@ -242,14 +244,15 @@ class BoundMotility(BoundEffect):
     ) -> tuple[State, Tensor, Tensor]:
         """The moves (N,) and turns, 0 in colonies in which one is too far, and the state that says
         so."""
-        usual = 0.5 * state.length * self._turn(state) * math.sqrt(dt)
-        size = torch.maximum(move.detach().abs(), usual.detach())
-        most = FARTHEST * (1.0 + ROUNDING) * state.radius.detach()
+        wide = (self._turn(state) * math.sqrt(dt)).detach()
+        size = torch.maximum(move.detach().abs(), 0.5 * state.length.detach() * wide)
+        most = (1.0 + ROUNDING) * FARTHEST * state.radius.detach()
         good = size <= most if self.meets else size < torch.inf
+        good = good & (wide <= (1.0 + ROUNDING) * WIDEST_TURN)
         if bool(good.all()):
             return state, move, turn
         at, bad = state.groups.first(~good)
-        report = MotilityReport(bad.long(), state.uid[at], size[at])
+        report = MotilityReport(bad.long(), state.uid[at], size[at], wide[at])
         state = state.replace(reports={**state.reports, self.title: report})
         still = state.groups.spread(bad)
         return state, torch.where(still, 0.0, move), torch.where(still.unsqueeze(1), 0.0, turn)
@@ -257,3 +260,9 @@ class BoundMotility(BoundEffect):
 
 def _first_heading(state: State, rows: Tensor, values: Values) -> Tensor:
     return torch.where(state.uniform(rows, "Motility heading") < 0.5, -1.0, 1.0)
+
+
+def _rounded_down(number: float) -> str:
+    """To two digits."""
+    digits = 10.0 ** (1 - math.floor(math.log10(number)))
+    return f"{math.floor(number * digits * (1.0 + ROUNDING)) / digits:g}"

@@ -59,11 +59,12 @@ def contact_steps(given: StepInput) -> StepResult:
         none, none, torch.zeros_like(given.hardness), none, none, none,
     )  # fmt: skip
     growth = given.growth / steps.clamp(min=1).index_select(0, given.groups.owner)
+    share = 1.0 / steps.double()
     if given.drift is not None:  # what cells have moved by themselves, in sub-steps as well
         at = _drifted(at, given, torch.where(steps > 1, -1.0, 0.0))
     for k in range(int(steps.max()) if steps.numel() else 0):
         if given.drift is not None:
-            at = _drifted(at, given, torch.where((steps > 1) & (k < steps), 1.0 / steps, 0.0))
+            at = _drifted(at, given, torch.where((steps > 1) & (k < steps), share, 0.0))
         at = _OneStep(given, at.length, growth, (k < steps) & (at.status != NOT_FINITE)).taken(at)
     return at
 
@@ -221,9 +222,9 @@ class _OneStep:
         margin = MARGIN * self.wide.index_select(0, owner)
         contacts = near_rows(pairs, None if settings.soft else margin)
         if given.bonds is not None:
-            now = Capsules(
-                at.position.T, at.axis.double().T, 0.5 * at.length.double(), given.radius
-            )
+            half, begin = 0.5 * at.length.double(), given.bonds.begin.half
+            half = torch.where(self.growth > 0, half, begin)  # the others are rigid
+            now = Capsules(at.position.T, at.axis.double().T, half, given.radius)
             contacts = with_bonds(contacts, given.bonds, now)
         solved = self._solved(at, contacts, walls, moving, cells, active, least, first_pass)
         part, end = solved.problem, solved.end

@@ -80,7 +80,10 @@ def depth_in_walls(
 def _each(given: Any) -> list[Any]:
     if isinstance(given, Tensor) or not hasattr(given, "values"):
         return [given]
-    return list(given.values()) if isinstance(given, Mapping) else [given.values]
+    inner = given.values() if isinstance(given, Mapping) else given.values
+    if isinstance(inner, Mapping):  # by cell type
+        inner = inner.values()
+    return [inner] if isinstance(inner, Tensor) else [x for part in inner for x in _each(part)]
 
 
 def _below_one(given: Any) -> bool:
