@@ -325,8 +325,7 @@ def test_fields_and_stages_are_those_of_the_effects_listed():
         and state.signals == {}
         and not any(n.startswith(OUTSIDE) for n in state.fields)
     )
-    of_contacts = {"contact_alpha", "contact_substeps", "collapsed_steps", "compression"}
-    of_mechanics = {"displacement", *of_contacts}
+    of_mechanics = {"displacement", "contact_alpha", "collapsed_steps", "compression"}
     known = {"divide_flag", "division_threshold", "growth_rate", "elongation", *of_mechanics}
     assert set(state.fields) == known and set(state.reports) == {"mechanics"}
     for more, added in (

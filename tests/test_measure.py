@@ -235,35 +235,15 @@ def test_cells_of_a_full_chamber_carry_what_gaps_do_not(dim, filled):
     assert mean(cells) == pytest.approx(mean(walls), rel=0.01)
 
 
-def test_forces_of_a_state_from_a_file_and_of_a_part_of_a_batch(tmp_path):
-    """In steps that take four sub-steps: a cell grows by 0.76 µm, and then by more."""
-    wall = tf.Plane(x=2.2, facing="-x")
-    scene = tf.Scene(
-        tf.Growth(rate=torch.tensor([2.5, 0.5])), tf.Mechanics(dim=2, walls=[wall]), dt=0.1,
-        founders=tf.Cells([[0.0, 0.0], [0.0, 1.05]], [[1.0, 0.0]] * 2, 2.0),
-    )  # fmt: skip
-    path = tmp_path / "run.h5"
-    *_, state = tf.simulate(scene, until=0.2, colonies=2, record=path)
-    assert state.contact_substeps.unique().tolist() == [1, 4]
-    with tf.Results(path) as results:
-        kept = results.state(scene)
-    press = tf.measure.pressure(state, scene)
-    force = tf.measure.wall_forces(state, [wall], scene.dt).force
-    assert float(press.max()) > 0 and float(force[0, 0]) > 0
-    for part, colonies in ((kept, [0, 1]), (state.select([0]), [0]), (state.select([1]), [1])):
-        mine = torch.isin(state.colony, torch.tensor(colonies))
-        assert torch.equal(tf.measure.pressure(part, scene), press[mine])
-        assert torch.equal(tf.measure.wall_forces(part, [wall], scene.dt).force, force[colonies])
-
-
 def test_pressure_of_cells_apart_and_of_what_is_no_scene():
     scene = tf.Scene(tf.Mechanics(dim=2), founders=tf.Cells([[0, 0], [5.0, 0]], [[0, 1.0]] * 2))
     *_, state = tf.simulate(scene, until=0.05, colonies=2)
     assert tf.measure.pressure(state, scene).tolist() == [0.0] * 4
     with pytest.raises(tf.InputError, match=r"pressure\(dt\) = 0"):
         tf.measure.pressure(state, scene, dt=0)
-    with pytest.raises(tf.InputError, match="in how many sub-steps"):
-        tf.measure.pressure(scene.bind().start(), scene)
+    for unknown in (state.select([0]), scene.bind().start()):
+        with pytest.raises(tf.InputError, match="in how many sub-steps"):
+            tf.measure.pressure(unknown, scene)
     with pytest.raises(tf.InputError, match=r"pressure\(scene\) = .*the tf.Scene of the state"):
         tf.measure.pressure(state, [])
     with pytest.raises(tf.InputError, match="contact_alpha"):

@@ -99,7 +99,7 @@ def test_an_effect_that_is_not_listed_leaves_no_field_and_no_report():
         "division_threshold",
     }
     # only one-sided contacts follow their force
-    of_force = {"contact_alpha", "contact_substeps", "compression"}
+    of_force = {"contact_alpha", "compression"}
     for contacts, own in (("one-sided", of_force), ("bilateral", set())):
         scene = tf.Scene(tf.Mechanics(dim=2, contacts=contacts))
         assert set(scene.bind().start().fields) == {"displacement", "collapsed_steps", *own}

@@ -127,12 +127,13 @@ def _softness(measure: str, state: State, dt: float) -> Tensor:
             f"{measure}: the state has no contact_alpha, the softness of one-sided contacts:"
             " simulate with tf.Mechanics(contacts='one-sided'), the default."
         )
-    steps = state.fields.get("contact_substeps")
-    if steps is None or bool((steps < 1).any()):
+    report: Any = state.reports.get("mechanics")
+    if report is None:
         raise checks.InputError(
-            f"{measure}: the state does not say in how many sub-steps its contacts were solved:"
-            " it is a first one. Give one that a step has made."
+            f"{measure}: the state does not say in how many sub-steps its contacts were solved."
+            " Give it as a step returns it: not a first one, nor one from a file or by select."
         )
+    steps = state.groups.spread(report.substeps.clamp(min=1))
     return state.contact_alpha.double() * dt / steps
 
 
@@ -179,7 +180,8 @@ def pressure(state: State, scene: Scene, dt: float | None = None) -> Tensor:
     0.00625 h. Adhesion pulls: where it does so more than contacts push, the pressure is below 0.
     dt: of the last step, h; by default that of the scene.
 
-    Raises InputError for bilateral contacts, and for a first state.
+    Raises InputError for bilateral contacts, and for a state that is not as a step returned it: it
+    lacks the number of sub-steps.
     """
     from torchfilm.scene import Scene  # it imports rooms that measure
 

@@ -251,7 +251,7 @@ def test_sub_steps_change_no_force(parts, backend):
         founders=cells, dt=0.01,
     )  # fmt: skip
     state = last(scene, 0.5, dtype=torch.float64)
-    assert int(state.contact_substeps[0]) == parts
+    assert int(state.reports["mechanics"].substeps[0]) == parts
     force = tf.measure.wall_forces(state, [wall], 0.01).force
     assert float(force[0, 0]) == pytest.approx(30.0, rel=0.01)
 
@@ -272,7 +272,7 @@ def test_sub_steps_change_no_bond():
         )  # fmt: skip
         state = last(scene, 0.5, dtype=torch.float64)
         gaps.append(float(pair_gaps(state, np.array([[0, 1]]))[0]))
-    assert int(state.contact_substeps[0]) == 4
+    assert int(state.reports["mechanics"].substeps[0]) == 4
     assert gaps == pytest.approx([0.15, 0.15], rel=1e-2)
 
 

@@ -212,7 +212,7 @@ def test_compiled_and_torch_agree(dim, parts):
         )  # fmt: skip
         start = seeded(scene, crowd(np.random.default_rng(8), 50, dim), "cpu", torch.float64)
         ends.append(run(scene, start, 3, 0.01))
-    assert int(ends[0].contact_substeps.max()) == parts
+    assert int(ends[0].reports["mechanics"].substeps.max()) == parts
     assert array((ends[0].position - ends[1].position).abs()).max() <= 1e-9
 
 

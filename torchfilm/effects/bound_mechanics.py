@@ -144,7 +144,6 @@ class BoundMechanics(BoundEffect):
             fields["elongation"] = found.elongation
         if found.contact_alpha is not None and found.compression is not None:
             fields |= {"contact_alpha": found.contact_alpha, "compression": found.compression}
-            fields["contact_substeps"] = state.groups.spread(found.substeps)
         report = MechanicsReport(**vars(found.report), substeps=found.substeps)
         return state.with_fields(**fields).replace(
             position=found.position, axis=found.axis, length=found.length,
@@ -180,7 +179,6 @@ class BoundMechanics(BoundEffect):
             found, new["compression"] = of_contacts
             given = self._given_alpha(state, dt, substeps)
             new["contact_alpha"] = found if given is None else given
-            new["contact_substeps"] = state.groups.spread(substeps)
         of_step = MechanicsReport(**vars(report), substeps=substeps)
         return state.with_fields(**new).replace(
             position=x, axis=axes, length=lengths,

@@ -209,9 +209,7 @@ class Mechanics(Effect):
         alpha = Field("contact_alpha", meaning, "1/μ/µm", internal=True)
         meaning = "how much shorter pressure has made a cell than it once was"
         compression = Field("compression", meaning, "µm", at_division="reset", internal=True)
-        meaning = "sub-steps in which the contacts of the last step were solved, 0 before the first"
-        steps = Field("contact_substeps", meaning, dtype=torch.int64, internal=True)
-        return move, collapsed, alpha, compression, steps
+        return move, collapsed, alpha, compression
 
     @property
     def _own_fields(self) -> tuple[str, ...]:

@@ -60,8 +60,7 @@ def check_fields(file: h5py.File, path: object, template: State) -> None:
         kinds["not in this scene:"] = [n for n in there if n not in here]
         raise InputError(
             f"{path} was recorded with other fields than this scene has ({_list_kinds(kinds)})."
-            " Undo the edit to resume the run, or start a new run; or the file is of an earlier"
-            " version of torchfilm, whose runs this one cannot go on with."
+            " Undo the edit to resume the run, or start a new run."
         )
     if "signals" in file and template.layout is None:
         raise InputError(
