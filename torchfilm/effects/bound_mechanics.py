@@ -169,7 +169,7 @@ class BoundMechanics(BoundEffect):
         walls = compiled.wall_arrays(*self._surfaces(state), state.colony_id, state.cells)
         made, report, substeps = compiled.step(
             self.settings, state.groups, dt, self.effect.max_elongation, cells, self._drags(state),
-            self._alphas(state), walls, self._bond_arrays(state, length - growth),
+            self._alphas(state), walls, self._bond_arrays(state, length, growth),
         )  # fmt: skip
         x, axes, lengths, moves, growths, fallen, *of_contacts = map(torch.from_numpy, made)
         new = {"displacement": moves, "collapsed_steps": fallen}
@@ -269,11 +269,13 @@ class BoundMechanics(BoundEffect):
         """How far cells have moved and turned by themselves in this step, (N, d + turns)."""
         return state.fields["drift"] if self.drifts else None
 
-    def _bond_arrays(self, state: State, base: np.ndarray) -> tuple[np.ndarray, ...] | None:
+    def _bond_arrays(
+        self, state: State, length: np.ndarray, growth: np.ndarray
+    ) -> tuple[np.ndarray, ...] | None:
         """As `kernels.bonds` takes what is given."""
-        bonds, drift = self._bonds(state, torch.from_numpy(base)), self._drift(state)
-        if bonds is None and drift is None:
+        if not (self.effect.adhesion or self.drifts):
             return None
+        bonds, drift = self._bonds(state, torch.from_numpy(length - growth)), self._drift(state)
         levels, reaches, own = compiled.NOTHING
         if bonds is not None:
             levels, reaches = as_array(bonds.levels, torch.float64), np.array(bonds.reaches)

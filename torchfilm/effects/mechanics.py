@@ -27,7 +27,7 @@ from torchfilm.resolver import Values
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import check_backend, why_torch
-from torchfilm.tools.row_checks import check_variable
+from torchfilm.tools.row_checks import check_variables
 from torchfilm.values import Rule, Value, checked, is_drawn, numbers, physical, quotient, smallest
 
 # The default length drag: free growth, but for bilateral contacts, which do not hold in it.
@@ -232,9 +232,7 @@ class Mechanics(Effect):
         if state.dim != self.dim:
             raise checks.input_error("Mechanics.dim", self.dim, f"{state.dim}, like the cells")
         for kind in self.adhesion:
-            for option in ("adhesin", "partner"):
-                if (name := getattr(kind, option)) is not None:
-                    check_variable(f"Adhesion.{option}", name, state, at_least_zero=True)
+            check_variables("Adhesion", state, adhesin=kind.adhesin, partner=kind.partner)
         for surface in self.surfaces():
             distance, _ = surface.gap_of_points(state.position, state.own_colony_id)
             behind = torch.nonzero(distance < 0).squeeze(1)

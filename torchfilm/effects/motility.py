@@ -16,7 +16,7 @@ from torchfilm.signals.schedule import each_value, warn_of_steps
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.random import fine_uniform
-from torchfilm.tools.row_checks import check_variable
+from torchfilm.tools.row_checks import check_names, check_variables
 from torchfilm.tools.vectors import safe_sqrt
 from torchfilm.tools.warn_once import warn
 from torchfilm.values import Value, numbers, physical
@@ -87,11 +87,7 @@ class Motility(Effect):
     may_repeat = False
 
     def __post_init__(self) -> None:
-        for name in ("factor", "reversal_factor"):
-            of = getattr(self, name)
-            if of is not None and not (isinstance(of, str) and of.isidentifier()):
-                rule = "the name of a species or a variable of the cells"
-                raise checks.input_error(f"Motility.{name}", of, rule)
+        check_names("Motility", factor=self.factor, reversal_factor=self.reversal_factor)
         if self.reversal_factor is not None and self.reversals is None:
             raise checks.input_error(
                 "Motility.reversal_factor", self.reversal_factor,
@@ -122,9 +118,8 @@ class Motility(Effect):
     def check(self, state: State, values: Values) -> None:
         if bool((state.heading.abs() != 1).any()):
             raise checks.InputError("Motility: heading of a first cell is neither 1 nor −1.")
-        for option in ("factor", "reversal_factor"):
-            if (name := getattr(self, option)) is not None:
-                check_variable(f"Motility.{option}", name, state, at_least_zero=True)
+        named = {"factor": self.factor, "reversal_factor": self.reversal_factor}
+        check_variables("Motility", state, **named)
 
     def check_step(self, dt: float, divides: bool) -> None:
         given = {name: value for name, (value, _) in self.physical_values().items()}

@@ -22,6 +22,7 @@ from torchfilm.physics.contacts import CandidateContacts, Capsules, Contacts
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.reads import rows_where
+from torchfilm.tools.row_checks import check_names
 from torchfilm.tools.vectors import cross, dot, safe_norm, safe_sqrt
 
 
@@ -56,11 +57,7 @@ class Adhesion(metaclass=checks.KnownKeywords):
         object.__setattr__(self, "strength", given)
         reach = checks.number("Adhesion.reach", self.reach, above=0.0, most=MOST_REACH)
         object.__setattr__(self, "reach", reach)
-        for name in ("adhesin", "partner"):
-            of = getattr(self, name)
-            if of is not None and not (isinstance(of, str) and of.isidentifier()):
-                rule = "the name of a species or a variable of the cells"
-                raise checks.input_error(f"Adhesion.{name}", of, rule)
+        check_names("Adhesion", adhesin=self.adhesin, partner=self.partner)
         if self.partner is not None and self.adhesin in (None, self.partner):
             raise checks.input_error(
                 "Adhesion.partner", self.partner, "another name than the adhesin, which is given",

@@ -166,6 +166,21 @@ def check_signals(fields: Mapping[str, Tensor]) -> None:
             raise checks.input_error(f"the field {name!r}, a signal,", bad, "0 or more everywhere")
 
 
+def check_names(owner: str, **given: Any) -> None:
+    """Raise InputError unless each is None or a name that a species or a variable may have."""
+    for option, name in given.items():
+        if name is not None and not (isinstance(name, str) and name.isidentifier()):
+            rule = "the name of a species or a variable of the cells"
+            raise checks.input_error(f"{owner}.{option}", name, rule)
+
+
+def check_variables(owner: str, state: Any, **given: str | None) -> None:
+    """As `check_variable`, not below 0, of those options that name one."""
+    for option, name in given.items():
+        if name is not None:
+            check_variable(f"{owner}.{option}", name, state, at_least_zero=True)
+
+
 def check_variable(label: str, name: str, state: Any, at_least_zero: bool = False) -> None:
     """Raise InputError unless `name` is a number of each cell of a first state; and is not below 0
     there, where so asked. label: the option by which it was named."""
