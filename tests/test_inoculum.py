@@ -20,6 +20,14 @@ def test_cells_are_scattered_evenly_and_none_overlap(dim):
     assert np.abs(cells.axis.mean(0)).max() < 5 / np.sqrt(dim * 600)
 
 
+@pytest.mark.parametrize(("dim", "count", "radius"), [(2, 100, 15.0), (3, 120, 6.5)])
+def test_dense_cells_find_room(dim, count, radius):
+    """Two fifths of a disc, a quarter of a ball: cells that have a place keep it."""
+    cells = tf.inoculum(count, radius=radius, dim=dim)
+    assert cells.overlaps() == []
+    assert np.linalg.norm(cells.position, axis=1).max() <= radius
+
+
 def test_shares_of_types():
     cells = tf.inoculum(31, radius=30.0, types={0: 0.9, 2: 0.1}, colonies=5, seed=1)
     kinds = cells.cell_type.reshape(5, 31)
@@ -55,7 +63,7 @@ def test_colonies_grow_from_it():
         ({"types": {0: 1.5}}, r"types\[0\] = 1.5"),
         ({"types": {-1: 1.0}}, "types = -1"),
         ({"types": [0, 1]}, "a share for each cell type"),
-        ({"radius": 2.0}, "30 cells of length 2 and radius 0.5 µm did not find room"),
+        ({"radius": 2.0}, "30 cells of length 2 and radius 0.5 µm would fill 426% of it, and did not"),
         ({"count": 0}, "count = 0"),
         ({"dim": 4}, "dim = 4"),
         ({"colonies": 0}, "colonies = 0"),
