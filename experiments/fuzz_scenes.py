@@ -75,7 +75,8 @@ def mechanics(draw: Contacts, capsules: Capsules, dt: float) -> tf.Mechanics:
         least = min([draw.viscosity, *(viscosity for _, viscosity in draw.drags)])
         if draw.sticks:
             strength = draw.sticks * least * 0.2 / dt
-            given["adhesion"] = [tf.Adhesion(each(draw, strength), reach=0.2)]
+            to = ("cells", "walls") if draw.wall else ("cells",)
+            given["adhesion"] = [tf.Adhesion(each(draw, strength), 0.2, to=x) for x in to]
     length_drag, viscosity = draw.length_drag, draw.viscosity
     if draw.drags:
         columns = zip(*draw.drags[: len(capsules.counts)], strict=True)

@@ -63,7 +63,7 @@ def test_colonies_grow_from_it():
         ({"types": {0: 1.5}}, r"types\[0\] = 1.5"),
         ({"types": {-1: 1.0}}, "types = -1"),
         ({"types": [0, 1]}, "a share for each cell type"),
-        ({"radius": 2.0}, "30 cells of length 2 and radius 0.5 µm would fill 426% of it, and did not"),
+        ({"radius": 2.0}, "30 cells of length 2 and radius 0.5 µm would fill 426% of it, and"),
         ({"count": 0}, "count = 0"),
         ({"dim": 4}, "dim = 4"),
         ({"colonies": 0}, "colonies = 0"),

@@ -111,7 +111,7 @@ def _colony(
 
 
 def _filled(count: int, radius: float, dim: int, length: float, cell_radius: float) -> float:
-    """The share of the disc, or the ball, that so many cells fill; the cells at its rim stick out."""
+    """The share of the disc, or the ball, that cells fill; those at its rim stick out of it."""
     across, around = 2.0 * length * cell_radius, np.pi * cell_radius**2
     if dim == 2:
         return count * (across + around) / (np.pi * (radius + cell_radius) ** 2)

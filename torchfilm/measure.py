@@ -12,23 +12,18 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import torch
 from torch import Tensor
 
-from torchfilm.physics.adhesion import Bonds, levels_of
-from torchfilm.physics.contacts import CandidateContacts, Capsules, gaps_nearby
-from torchfilm.physics.near_rows import near_rows
-from torchfilm.physics.surfaces import FlatSurface
-from torchfilm.physics.wall_contacts import find_wall_contacts
+from torchfilm.contact_forces import bonds_of, pushed_by_cells, pushed_by_walls, softness
+from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.physics.surfaces import FlatSurface, Surface
 from torchfilm.physics.walls import Wall, depth_in_walls
 from torchfilm.state import CELL, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.threads import one_torch_thread
-from torchfilm.tools.vectors import cross, safe_norm
-from torchfilm.values import ByType, PerColony, Rule, checked, is_drawn
+from torchfilm.tools.vectors import safe_norm
 
 if TYPE_CHECKING:
     from torchfilm.scene import Scene
-
-END_ON = 1e-4  # squared sine of the angle between a cell and a force on its end
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -88,6 +83,10 @@ def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
     return Overlap(mean, pairs.max(depth[deep]), count, state.groups.max(at_walls))
 
 
+def _surfaces_of(scene: Scene) -> list[Surface]:
+    return [s for e in scene.effects for s in e.wall_surfaces()]
+
+
 @dataclass(frozen=True)
 class WallForces:
     """The forces of each colony's cells on walls. force: (B, S) μ·µm²/h, at right angles to each of
@@ -101,68 +100,28 @@ class WallForces:
 
 @of_a_state
 @torch.no_grad()
-def wall_forces(state: State, walls: Sequence[Wall], dt: float) -> WallForces:
+def wall_forces(state: State, walls: Sequence[Wall] | Scene, dt: float) -> WallForces:
     """The forces on walls in the last step, of dt hours, by one-sided contacts.
 
     A contact pushes with its overlap / (α Δt), on a soft wall with its overlap × stiffness. Divide
     by the length of a wall (2-D) or its area for the pressure, averaged over steps: one step's is
-    as exact as its solve. walls: those of the scene's Mechanics, whose stiffness is not drawn.
+    as exact as its solve. walls: those of the scene's Mechanics, whose stiffness is not drawn; or
+    the scene, with which the pull of `tf.Adhesion` to walls counts: a force below 0.
     """
-    _check_walls("wall_forces", walls)
-    soft = _softness("wall_forces", state, checks.number("wall_forces(dt)", dt, above=0.0))
-    surfaces = [s for wall in walls for s in wall.surfaces(state.dim)]
-    pushes = _pushed_by_walls(state, surfaces, soft)
+    from torchfilm.scene import Scene  # it imports rooms that measure
+
+    if isinstance(walls, Scene):
+        bonds, surfaces = bonds_of(state, walls), _surfaces_of(walls)
+    else:
+        _check_walls("wall_forces", walls)
+        bonds, surfaces = None, [s for wall in walls for s in wall.surfaces(state.dim)]
+    soft = softness("wall_forces", state, checks.number("wall_forces(dt)", dt, above=0.0))
+    pushes = pushed_by_walls(state, surfaces, soft, bonds)
     assert pushes.surface is not None
     at = state.colony.index_select(0, pushes.cell) * len(surfaces) + pushes.surface
     force = Groups(at, state.colonies * len(surfaces)).sum(pushes.force.unsqueeze(1))
     facing = tuple(s.normal if isinstance(s, FlatSurface) else None for s in surfaces)
     return WallForces(force.view(state.colonies, len(surfaces)), facing)
-
-
-def _softness(measure: str, state: State, dt: float) -> Tensor:
-    """α Δt of each cell's contacts in a step of dt hours, or in its sub-steps, (N,): a contact
-    pushes with its overlap over this."""
-    if "contact_alpha" not in state.fields:
-        raise checks.InputError(
-            f"{measure}: the state has no contact_alpha, the softness of one-sided contacts:"
-            " simulate with tf.Mechanics(contacts='one-sided'), the default."
-        )
-    report: Any = state.reports.get("mechanics")
-    if report is None:
-        raise checks.InputError(
-            f"{measure}: the state does not say in how many sub-steps its contacts were solved."
-            " Give it as a step returns it: not a first one, nor one from a file or by select."
-        )
-    steps = state.groups.spread(report.substeps.clamp(min=1))
-    return state.contact_alpha.double() * dt / steps
-
-
-@dataclass(frozen=True)
-class _Pushes:
-    """Forces on cells at contacts. cell: (K,) whom each pushes. force: (K,) μ·µm²/h. arm: (K,) µm,
-    how far the contact is from the cell's centre, along the force. surface: (K,) of which wall, or
-    None of pushes between cells."""
-
-    cell: Tensor
-    force: Tensor
-    arm: Tensor
-    surface: Tensor | None = None
-
-
-def _pushed_by_walls(state: State, surfaces: Sequence[Any], soft: Tensor) -> _Pushes:
-    """soft: as `_softness` says, (N,)."""
-    if not surfaces:
-        none = state.uid.new_empty(0)
-        return _Pushes(none, soft.new_empty(0), soft.new_empty(0), none)
-    length, radius = state.length.double(), state.radius.double()
-    placed = state.position, state.axis.double(), length, radius
-    rows = find_wall_contacts(surfaces, *placed, state.own_colony_id)
-    # D² / (α Δt) of each cell at each surface: a stiffness
-    hold = torch.stack([_held(s.wall, soft, state) for s in surfaces])
-    root = rows.row[:, : state.dim].norm(dim=1)
-    force = root * -rows.gap * hold[rows.surface, rows.cell]
-    arm = radius[rows.cell] + (length[rows.cell] * rows.row[:, -1] + rows.gap) / root
-    return _Pushes(rows.cell, force, arm, rows.surface)
 
 
 @of_a_state
@@ -188,97 +147,18 @@ def pressure(state: State, scene: Scene, dt: float | None = None) -> Tensor:
     if not isinstance(scene, Scene):
         raise checks.input_error("pressure(scene)", scene, "the tf.Scene of the state")
     dt = checks.number("pressure(dt)", scene.dt if dt is None else dt, above=0.0)
-    soft = _softness("pressure", state, dt)
-    surfaces = [s for e in scene.effects for s in e.wall_surfaces()]
+    soft = softness("pressure", state, dt)
+    surfaces = _surfaces_of(scene)
     soft_cells = any(e.soft_contacts for e in scene.effects)
     total = torch.zeros_like(soft)
-    at_walls = _pushed_by_walls(state, surfaces, soft)
-    bonds = _bonds(state, scene)
-    for pushes in (*_pushed_by_cells(state, soft, soft_cells, bonds), at_walls):
+    bonds = bonds_of(state, scene)
+    at_walls = pushed_by_walls(state, surfaces, soft, bonds)
+    for pushes in (*pushed_by_cells(state, soft, soft_cells, bonds), at_walls):
         virial = (pushes.force * pushes.arm).unsqueeze(1)
         total = total + Groups(pushes.cell, state.cells).sum(virial).squeeze(1)
     length, radius = state.length.double(), state.radius.double()
     from_above = 2 * radius * length + torch.pi * radius**2
     return total / (2 * from_above if state.dim == 2 else 3 * state.volume.double())
-
-
-def _pushed_by_cells(
-    state: State, soft: Tensor, soft_cells: bool, bonds: Bonds | None
-) -> tuple[_Pushes, _Pushes]:
-    """The pushes of a contact on its first cell and on its second, below 0 where they pull. soft:
-    as `_softness` says, (N,)."""
-    axis, length, radius = state.axis.double(), state.length.double(), state.radius.double()
-    apart = 0.0 if bonds is None else max(bonds.reaches)
-    first, second, gap = gaps_nearby(
-        state.position, axis, length, radius, state.colony, state.colonies, apart
-    )
-    near = torch.nonzero(gap < apart).squeeze(1)
-    first, second = first.index_select(0, near), second.index_select(0, near)
-    start = state.position.index_select(0, state.groups.begin[:-1].index_select(0, state.colony))
-    capsules = Capsules((state.position - start).T, axis.T, 0.5 * length, radius)
-    margin = None if soft_cells else torch.zeros_like(gap.index_select(0, near))
-    rows = near_rows(CandidateContacts.all_of(capsules, first, second), margin)
-    force = rows.weight * (-rows.gap).clamp(min=0) / soft.index_select(0, rows.first)
-    if bonds is not None:
-        stiffness = bonds.stiffness(rows.first, rows.second, rows.gap)
-        force = force - rows.weight * stiffness * rows.gap.clamp(min=0)
-
-    def on(cell: Tensor, row: Tensor) -> _Pushes:
-        normal, turn = row[:, : state.dim], row[:, state.dim : -1]
-        own = axis.index_select(0, cell)
-        # the turn is the arc length of the contact times this
-        across = cross(own.T, normal.T).T
-        square = across.square().sum(1)
-        along = (own * normal).sum(1) * (turn * across).sum(1) / square.clamp(min=1e-9)
-        # the end of a cell that is met head on
-        along = torch.where(square < END_ON, length[cell] * row[:, -1], along)
-        return _Pushes(cell, force, radius[cell] + along + 0.5 * rows.gap)
-
-    return on(rows.first, rows.row_first), on(rows.second, rows.row_second)
-
-
-def _bonds(state: State, scene: Scene) -> Bonds | None:
-    """What holds the cells together as they now are."""
-    from torchfilm.effects.mechanics import Mechanics  # it imports rooms that measure
-
-    for effect in scene.effects:
-        if isinstance(effect, Mechanics) and effect.adhesion:
-            names = [f"adhesion[{k}].strength" for k in range(len(effect.adhesion))]
-            values, drawn = effect.physical_values(), effect.kept_values()
-            strengths = [
-                state.fields[drawn[n].name] if n in drawn else _of_cells(values[n][0], state)
-                for n in names
-            ]
-            levels = levels_of(effect.adhesion, strengths, state.fields, state.cells)
-            cells = state.position.T, state.axis.double().T, 0.5 * state.length.double()
-            begin = Capsules(*cells, state.radius.double())
-            return Bonds(levels, tuple(kind.reach for kind in effect.adhesion), begin)
-    return None
-
-
-def _of_cells(value: Any, state: State) -> Tensor:
-    """A value that is not drawn, one number, one for each colony or cell type, of each cell."""
-    if isinstance(value, ByType):
-        own = torch.zeros_like(state.length, dtype=torch.float64)
-        for kind, of_kind in value.values.items():
-            own = torch.where(state.cell_type == kind, _of_cells(of_kind, state), own)
-        return own
-    given = value.values if isinstance(value, PerColony) else value
-    each = torch.as_tensor(given, dtype=torch.float64, device=state.device)
-    own = each.index_select(0, state.own_colony_id) if each.dim() else each
-    return own.expand(state.cells)
-
-
-def _held(wall: Wall, soft: Tensor, state: State) -> Tensor:
-    given = wall.weight if wall.stiffness is None else wall.stiffness
-    if given is None:
-        return 1.0 / soft
-    name = f"{type(wall).__name__}.{'weight' if wall.stiffness is None else 'stiffness'}"
-    if is_drawn(given := checked(name, given, Rule(above=0.0))):
-        rule = "one number or one for each colony or cell type, to measure forces"
-        raise checks.input_error(name, given, rule)
-    own = _of_cells(given, state)
-    return own if wall.stiffness is not None else own * own / soft
 
 
 @of_a_state

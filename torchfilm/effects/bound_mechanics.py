@@ -13,7 +13,7 @@ from torch import Tensor
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.mechanics_report import MechanicsReport
 from torchfilm.physics import capsule, compiled, torch_step
-from torchfilm.physics.adhesion import Bonds, levels_of
+from torchfilm.physics.adhesion import Bonds, holds_of, levels_of
 from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.contacts import Capsules
 from torchfilm.physics.one_sided_records import OneSidedSettings
@@ -59,6 +59,7 @@ class BoundMechanics(BoundEffect):
         ]
         self.compiled = effect.backend_on(binding.batch.device) == "compiled"
         surfaces = [s for wall in self.walls for s in wall.surfaces(effect.dim)]
+        self.holds = holds_of(effect.adhesion, self.walls, effect.dim)
         entries = [tensor for surface in surfaces for tensor in _tensors(surface)]
         self.needs_gradient = self.values.requires_grad or any(x.requires_grad for x in entries)
         drawn = (v.field for v in vars(self.values).values() if v is not None)
@@ -261,9 +262,8 @@ class BoundMechanics(BoundEffect):
             return None
         strengths = [self.values[f"adhesion[{k}].strength"] for k in range(len(kinds))]
         levels = levels_of(kinds, [x.of_cells(state) for x in strengths], state.fields, state.cells)
-        return Bonds(
-            levels, tuple(kind.reach for kind in kinds), _begin(state, base, self._drift(state))
-        )
+        begin = _begin(state, base, self._drift(state))
+        return Bonds(levels, tuple(kind.reach for kind in kinds), begin, self.holds)
 
     def _drift(self, state: State) -> Tensor | None:
         """How far cells have moved and turned by themselves in this step, (N, d + turns)."""
@@ -276,12 +276,13 @@ class BoundMechanics(BoundEffect):
         if not (self.effect.adhesion or self.drifts):
             return None
         bonds, drift = self._bonds(state, torch.from_numpy(length - growth)), self._drift(state)
-        levels, reaches, own = compiled.NOTHING
+        levels, reaches, own, holds = compiled.NOTHING
         if bonds is not None:
             levels, reaches = as_array(bonds.levels, torch.float64), np.array(bonds.reaches)
+            holds = np.array(bonds.holds)
         if drift is not None:
             own = as_array(drift, torch.float64)
-        return levels, reaches, own
+        return levels, reaches, own, holds
 
     def _surfaces(self, state: State) -> tuple[list[Surface], list[tuple[str, Tensor | None]]]:
         """The surfaces of all walls; the kind of each, and its stiffness or weight, 0-dim or

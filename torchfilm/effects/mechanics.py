@@ -17,7 +17,7 @@ from torchfilm.kernels.bilateral_scheme import CLOSE, PENALTY, TOLERANCE
 from torchfilm.kernels.scheme import OVERLAP, PASSES
 from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
 from torchfilm.parameters import number_range
-from torchfilm.physics.adhesion import Adhesion
+from torchfilm.physics.adhesion import Adhesion, check_walls_of
 from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.initial_overlaps import check_apart, check_fits, check_room
 from torchfilm.physics.one_sided_records import OneSidedSettings
@@ -113,6 +113,7 @@ class Mechanics(Effect):
             raise checks.input_error(
                 "Mechanics.adhesion", self.adhesion, "left out with bilateral contacts", hint
             )
+        check_walls_of(self.adhesion, len(self.walls))
         for name in ("passes", "max_iterations"):
             if (given := getattr(self, name)) is not None:
                 object.__setattr__(self, name, checks.integer(f"Mechanics.{name}", given, least=1))
@@ -431,5 +432,6 @@ def _of_adhesion(kind: Adhesion) -> str:
     pull = f"{number_range(numbers(strength))} μ·µm²/h"
     pull = "a strength drawn for each cell" if is_drawn(strength) else f"up to {pull}"
     levels = " and ".join(kind.levels)
-    by = f", in proportion to {levels} of both cells" if levels else ""
-    return f"adhesion: a pull of {pull} at a gap of {kind.reach:g} µm{by}"
+    by = f", in proportion to {levels}" + " of both cells" * (kind.to == "cells") if levels else ""
+    to = {"cells": "", "walls": " of each end to walls"}.get(str(kind.to), f" to wall {kind.to}")
+    return f"adhesion{to}: a pull of {pull} at a gap of {kind.reach:g} µm{by}"

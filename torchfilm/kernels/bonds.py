@@ -1,10 +1,10 @@
-"""Cells that move by themselves, and rows that pull: of cells that stick together, see
-`physics.adhesion`.
+"""Cells that move by themselves, and rows that pull: of cells that stick together, or to walls,
+see `physics.adhesion`.
 
-given: levels (N, 2 K), reaches (K,), and how far the cells have moved and turned by themselves in
-this step, (N, d + turns); of no cells where there is none of it.
-bonds: levels (n, 2 K) and reaches (K,), and where the cells are as the step begins: position
-(n, d), axis (n, d) and half length (n,). All are float64.
+given: levels (N, 2 K), reaches (K,), how far the cells have moved and turned by themselves in this
+step, (N, d + turns), and what holds, (K, 1 + S) bool; of no cells where there is none of it.
+bonds: levels (n, 2 K) and reaches (K,), where the cells are as the step begins: position (n, d),
+axis (n, d) and half length (n,), all float64; and what holds.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def move_along(x, axis, drift, share, dof):
 def bonds_of(memory, of, dt, given, x, axis, length, drift, dof):
     """The bonds of the cells `of`, with levels of stiffness · dt. x, axis: after the drift. length:
     (n,) before growth."""
-    levels, reaches, _ = given
+    levels, reaches, _, holds = given
     n = of.shape[0] if reaches.shape[0] else 0
     own, half = room(memory, (n, levels.shape[1]), np.float64), room(memory, (n,), np.float64)
     for i in range(n):
@@ -62,23 +62,27 @@ def bonds_of(memory, of, dt, given, x, axis, length, drift, dof):
         put(x, begin_x)
         put(axis, begin_axis)
         move_along(begin_x, begin_axis, drift, -1.0, dof)
-    return own, reaches, begin_x, begin_axis, half
+    return own, reaches, begin_x, begin_axis, half, holds
 
 
 @lean
 def reach_of(bonds, drift, dof):
-    """The gap, µm, up to which cells may hold each other, also where they have drifted apart."""
-    reaches, half, most, way = bonds[1], bonds[4], 0.0, 0.0
+    """The gaps, µm, up to which cells may hold each other, and walls may hold cells, also where
+    they have drifted apart."""
+    reaches, half, holds, cells, walls, way = bonds[1], bonds[4], bonds[5], 0.0, 0.0, 0.0
     d = 2 if len(dof) == 4 else 3
     for k in range(reaches.shape[0]):
-        most = max(most, reaches[k])
+        if holds[k, 0]:
+            cells = max(cells, reaches[k])
+        if holds[k, 1:].any():
+            walls = max(walls, reaches[k])
     for i in range(drift.shape[0] if reaches.shape[0] else 0):
         move, turn = 0.0, 0.0
         for k in range(drift.shape[1]):
             move += drift[i, k] * drift[i, k] if k < d else 0.0
             turn += drift[i, k] * drift[i, k] if k >= d else 0.0
         way = max(way, math.sqrt(move) + half[i] * math.sqrt(turn))
-    return most + 2.0 * way
+    return cells + 2.0 * way * (cells > 0), walls + way * (walls > 0)
 
 
 @lean
@@ -107,18 +111,16 @@ def add_bonds(rows, first, end, x, axis, half, radius, scale, bonds, alpha, dof)
 @lean
 def _gap_at_begin(H, gaps, r, i, j, x, axis, half, scale, bonds, dof):
     """The gap of row r as the step began, µm, to first order in what has moved since."""
-    d, weight, gap = 2 if len(dof) == 4 else 3, 0.0, gaps[r]
-    for k in range(d):
-        weight += (H[2 * r, k] / scale[i, k]) ** 2
+    gap = gaps[r]
     gap += _opened(H, 2 * r, i, x, axis, half, scale, bonds, dof)
     gap += _opened(H, 2 * r + 1, j, x, axis, half, scale, bonds, dof)
-    return gap / math.sqrt(weight)
+    return gap / _weight(H, 2 * r, i, scale, dof)
 
 
 @lean
 def _opened(H, h, i, x, axis, half, scale, bonds, dof):
     """How much one half of a row has closed its gap since the step began."""
-    _, _, begin_x, begin_axis, begin_half = bonds
+    _, _, begin_x, begin_axis, begin_half, _ = bonds
     d, last = 2 if len(dof) == 4 else 3, degrees(dof) - 1
     ax, ay, bx, by = begin_axis[i, 0], begin_axis[i, 1], axis[i, 0], axis[i, 1]
     change = H[h, d + (0 if d == 2 else 2)] / scale[i, d] * (ax * by - ay * bx)
@@ -137,7 +139,7 @@ def _opened(H, h, i, x, axis, half, scale, bonds, dof):
 def _stiffness(bonds, i, j, touching, gap, dof):
     """Of the pair of cells i and j, whose radii are `touching`, in a row with this gap; both gaps
     as the step began."""
-    levels, reaches, x, axis, half = bonds
+    levels, reaches, x, axis, half, holds = bonds
     bz, az, cz = 0.0, 0.0, 0.0
     if len(dof) == 8:
         bz, az, cz = x[j, 2] - x[i, 2], axis[i, 2], axis[j, 2]
@@ -147,7 +149,52 @@ def _stiffness(bonds, i, j, touching, gap, dof):
     )  # fmt: skip
     widest, stiffness = max(gap, math.sqrt(square) - touching), 0.0
     for k in range(reaches.shape[0]):
-        if widest < reaches[k]:
+        if holds[k, 0] and widest < reaches[k]:
             a, b = 2 * k, 2 * k + 1
             stiffness += levels[i, a] * levels[j, b] + levels[i, b] * levels[j, a]
     return stiffness
+
+
+@lean
+def add_wall_bonds(rows, first, end, x, axis, half, roots, scale, bonds, alpha, dof):
+    """Adds rows that pull, after the `end` rows of which the `first` are of walls: one for each of
+    these whose wall holds the cell. Returns how many rows there are. alpha: (n,). roots: (S, n) D
+    of walls and cells."""
+    H, gaps, one, two, kind = rows
+    levels, reaches, _, _, _, holds = bonds
+    new = end
+    for r in range(first):
+        i, w, stiffness = one[r], -1 - two[r], 0.0
+        weight = _weight(H, 2 * r, i, scale, dof)
+        gap = (gaps[r] + _opened(H, 2 * r, i, x, axis, half, scale, bonds, dof)) / weight
+        for k in range(reaches.shape[0]):
+            if holds[k, 1 + w] and gap < reaches[k]:
+                stiffness += levels[i, 2 * k] * levels[i, 2 * k + 1]
+        if stiffness == 0.0:
+            continue
+        root = math.sqrt(stiffness * alpha[i]) / roots[w, i]
+        for k in range(len(dof)):
+            H[2 * new, k], H[2 * new + 1, k] = -root * H[2 * r, k], 0.0
+        gaps[new], one[new], two[new], kind[new] = -root * gaps[r], i, two[r], STIFF
+        new += 1
+    return new
+
+
+@lean
+def _weight(H, h, i, scale, dof):
+    """D of a half of a row of cell i."""
+    square = 0.0
+    for k in range(2 if len(dof) == 4 else 3):
+        square += (H[h, k] / scale[i, k]) ** 2
+    return math.sqrt(square)
+
+
+@lean
+def room_of_bonds(bonds, pairs, walls):
+    """How many rows there may be of so many rows of pairs and of walls, with those that pull."""
+    holds, most = bonds[5], pairs + walls
+    if holds[:, :1].any():
+        most += pairs
+    if holds[:, 1:].any():
+        most += walls
+    return most

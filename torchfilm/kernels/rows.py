@@ -1,7 +1,8 @@
 """Rows of the contact problem of one colony: pairs of cells, and cells at walls.
 
-A row r of two cells has two halves, H[2 r] and H[2 r + 1]; a row of one cell has two[r] = −1 and
-only the first. Halves are scaled by the row's weight and by M^(−½), as in `physics.problem`.
+A row r of two cells has two halves, H[2 r] and H[2 r + 1]; a row of one cell has two[r] < 0, at a
+wall w −1 − w, and only the first. Halves are scaled by the row's weight and by M^(−½), as in
+`physics.problem`.
 """
 
 from __future__ import annotations
@@ -129,7 +130,7 @@ def wall_rows(x, axis, half, radius, scale, kinds, places, sizes, roots, reach, 
                 if hold and gap > 0.0:
                     weight, gap = weight * (1.0 - gap / reach[i]), 0.0
                 _put_half(H, 2 * r, i, weight, s, end, nx, ny, nz, axis, scale, dof)
-                gaps[r], one[r], two[r], soft[r] = weight * gap, i, -1, kind
+                gaps[r], one[r], two[r], soft[r] = weight * gap, i, -1 - w, kind
                 r += 1
     return r, deepest
 

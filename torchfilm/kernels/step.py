@@ -8,7 +8,15 @@ import math
 import numpy as np
 
 from torchfilm.kernels.batch import put, put_back
-from torchfilm.kernels.bonds import add_bonds, bonds_of, drift_of, move_along, reach_of
+from torchfilm.kernels.bonds import (
+    add_bonds,
+    add_wall_bonds,
+    bonds_of,
+    drift_of,
+    move_along,
+    reach_of,
+    room_of_bonds,
+)
 from torchfilm.kernels.colonies import (
     CLIPPED,
     DEEPLY,
@@ -76,8 +84,7 @@ def _wall_contacts(memory, x, axis, half, radius, scale, at, found, bonds, like,
     `found` and of `bonds`; how many there are, and the deepest gap. at: the walls, and weight and
     reach by cell."""
     (kinds, places, sizes, is_soft, _), root, reach = at
-    of_pairs = most_rows(dof) * found[4].shape[0] * (2 if bonds[1].shape[0] else 1)
-    most = of_pairs + 3 * kinds.shape[0] * x.shape[0]
+    most = room_of_bonds(bonds, most_rows(dof) * found[4].shape[0], 3 * kinds.shape[0] * x.shape[0])
     rows = room_for_rows(memory, most, like, dof)
     walls, deepest = wall_rows(
         x, axis, half, radius, scale, kinds, places, sizes, root, reach, rows, is_soft, False, dof,
@@ -192,10 +199,10 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
 
     x, axis (n, d) float64. length to shortest: (n,). last: (n, D) the move from which to start.
     hardness: (1,) α. walls: kinds, places, sizes, which are soft, and (S, n) their D, or
-    stiffness · Δt. alphas: (n,), or (0,). bonds and their reach, µm: see `kernels.bonds`.
+    stiffness · Δt. alphas: (n,), or (0,). bonds and their reaches, µm: see `kernels.bonds`.
     """
     margin, target, deep, limits, passes = _of_colony(length, growth, radius, drag, settings)
-    tolerance, given, near = settings[TOLERANCE], alphas.shape[0] > 0, margin + reach
+    tolerance, given, near = settings[TOLERANCE], alphas.shape[0] > 0, margin + reach[0]
     hardness[0] = hardness[0] if hardness[0] > 0 else limits[0]
     arrays = _arrays(memory, length, growth, shortest, last, walls[4])
     half, y, kept = arrays[2], arrays[6], arrays[7]
@@ -207,7 +214,7 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
         give_back(memory, top)  # the contacts are kept, not what was made of them
         rows, at_walls, deepest = _prepared(
             memory, x, axis, growth, radius, drag, last, number == 0, rising, hardness[0], softer,
-            walls, alphas, bonds, margin, found, arrays, dof,
+            walls, alphas, bonds, margin + reach[1], found, arrays, dof,
         )  # fmt: skip
         if number > 0 and not deeply:  # cells do not lie deep in others; but in a wall?
             if deepest >= -deep:
@@ -280,7 +287,7 @@ def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, number, a
     """Solve a pass, of which `walls` rows are made: the first for all cells, a later one for those
     that lie deep and those near them. Returns the error, each row's gap after the move, and how
     many rows there are."""
-    _, _, half, _, (alpha, low), scale, y, _, _ = arrays
+    _, _, half, (_, root), (alpha, low), scale, y, _, _ = arrays
     far = margin * (settings[SOFT] <= 0)
     some, hops = len(y) * (number > 0), min(HOPS * number, MOST_HOPS)
     numbers, count, mine = deep_cells(memory, found, rows, walls, deep, some, hops)
@@ -291,7 +298,10 @@ def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, number, a
     else:
         m = pair_rows(memory, x, axis, half, radius, scale, mine, walls, rows, far, dof)
     if bonds[1].shape[0]:
-        m = add_bonds(rows, walls, m, x, axis, half, radius, scale, bonds, alpha, dof)
+        if bonds[5][:, 0].any():
+            m = add_bonds(rows, walls, m, x, axis, half, radius, scale, bonds, alpha, dof)
+        if walls > 0 and bonds[5][:, 1:].any():
+            m = add_wall_bonds(rows, walls, m, x, axis, half, root, scale, bonds, alpha, dof)
     error, e = _minimise_some(
         memory, rows, m, numbers, count, alpha, low, y, cap, settings, report, team, dof
     )

@@ -1,16 +1,17 @@
-"""Adhesion: cells that touch, or nearly, hold on to each other.
+"""Adhesion: cells that touch, or nearly, hold on to each other, or to walls.
 
 Two cells whose surfaces are g apart pull each other with the force S g / reach, up to S where they
 part: beyond `reach` nothing holds them. S is the strength that both give the pair. What pulls is a
 row of the contact problem like that of a soft wall, turned round: with D² = (S / reach) · α · Δt it
 acts where the gap after the move is above 0: the pull is that at the end of the step, so that
 strong bonds are stable. Which pairs hold each other is decided where a step begins, so that a pair
-parts between steps.
+parts between steps. A wall holds an end of a cell in the same way.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,6 +20,8 @@ import torch
 from torch import Tensor
 
 from torchfilm.physics.contacts import CandidateContacts, Capsules, Contacts
+from torchfilm.physics.wall_contacts import WallContacts
+from torchfilm.physics.walls import Wall
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.reads import rows_where
@@ -28,7 +31,7 @@ from torchfilm.tools.vectors import cross, dot, safe_norm, safe_sqrt
 
 @dataclass(frozen=True)
 class Adhesion(metaclass=checks.KnownKeywords):
-    """Cells stick together: `tf.Mechanics(adhesion=[tf.Adhesion(strength=100.0)])`.
+    """Cells stick together, or to walls: `tf.Mechanics(adhesion=[tf.Adhesion(strength=100.0)])`.
 
     strength: μ·µm²/h, the greatest pull between two cells, where they are about to part. (A cell
     with a centreline of 4 µm, 1 µm wide, that moves at v µm/h has a drag of μ · 5 µm · v.) One
@@ -43,14 +46,19 @@ class Adhesion(metaclass=checks.KnownKeywords):
     binds instead of to itself: adhesin · partner, and partner · adhesin. With levels, `strength` is
     that of a pair in which they are 1.
 
-    Raises InputError for a strength below 0, a reach that is not above 0, and for a partner without
-    an adhesin.
+    to: "cells"; "walls" for all walls of the same Mechanics; or one of them by its number, from 0.
+    Each end of a cell sticks to a wall by itself, with the cell's own strength and level: one that
+    lies on a wall is held twice as strongly as one that stands on it. It may slide along the wall.
+
+    Raises InputError for a strength below 0, a reach that is not above 0, a partner without an
+    adhesin or of walls, and for walls that are not there.
     """
 
     strength: Any
     reach: float = 0.1
     adhesin: str | None = None
     partner: str | None = None
+    to: str | int = "cells"
 
     def __post_init__(self) -> None:
         given = checks.part_value("Adhesion.strength", self.strength, least=0.0)
@@ -63,11 +71,42 @@ class Adhesion(metaclass=checks.KnownKeywords):
                 "Adhesion.partner", self.partner, "another name than the adhesin, which is given",
                 "Leave it out where the adhesin binds to itself.",
             )  # fmt: skip
+        if self.to not in ("cells", "walls"):
+            hint = 'The number of a wall in Mechanics(walls=[…]), else "cells" or "walls".'
+            found = checks.integer("Adhesion.to", self.to, least=0, hint=hint)
+            object.__setattr__(self, "to", found)
+        if self.partner is not None and self.to != "cells":
+            raise checks.input_error(
+                "Adhesion.partner", self.partner, "left out: a wall has no species",
+                "The pull is in proportion to the adhesin.",
+            )  # fmt: skip
 
     @property
     def levels(self) -> tuple[str, ...]:
         """What it reads of the cells, beside their strength."""
         return tuple(name for name in (self.adhesin, self.partner) if name is not None)
+
+
+def check_walls_of(kinds: Sequence[Adhesion], walls: int) -> None:
+    """Raise InputError for adhesion to walls that are not there."""
+    for kind in kinds:
+        if kind.to != "cells" and (walls == 0 or (kind.to != "walls" and int(kind.to) >= walls)):
+            bound = (
+                f"below {walls}, the number of walls" if walls else '"cells": there are no walls'
+            )
+            raise checks.input_error(
+                "Adhesion.to", kind.to, bound, "Mechanics(walls=[…]) lists them, from 0."
+            )
+
+
+def holds_of(
+    kinds: Sequence[Adhesion], walls: Sequence[Wall], dim: int
+) -> tuple[tuple[bool, ...], ...]:
+    """Of each kind whether it is between cells, and of which surfaces of the walls: see `Bonds`."""
+    of_wall = [k for k, wall in enumerate(walls) for _ in wall.surfaces(dim)]
+    return tuple(
+        (kind.to == "cells", *(kind.to in ("walls", k) for k in of_wall)) for kind in kinds
+    )
 
 
 # µm: pairs that are farther apart have other cells between them.
@@ -76,17 +115,20 @@ MOST_REACH = 5.0
 
 @dataclass(frozen=True)
 class Bonds:
-    """What holds pairs of cells together in a step, of K kinds.
+    """What holds cells together, or to S surfaces, in a step, of K kinds.
 
     levels: (N, 2 K) float64. A pair (i, j) that is nearer than the reach of kind k as the step
     begins has the stiffness levels[i, 2k] · levels[j, 2k+1] + levels[i, 2k+1] · levels[j, 2k],
-    μ·µm/h; in the input of contact steps times Δt. reaches: (K,) µm. begin: (N,) the cells as the
-    step begins: before they move by themselves, which would else part them unhindered.
+    μ·µm/h; an end of a cell at a wall has levels[i, 2k] · levels[i, 2k+1]. In the input of contact
+    steps they are times Δt. reaches: (K,) µm. begin: (N,) the cells as the step begins: before they
+    move by themselves, which would else part them unhindered. holds: K × (1 + S), whether a kind is
+    between cells, and of which surfaces.
     """
 
     levels: Tensor
     reaches: tuple[float, ...]
     begin: Capsules
+    holds: tuple[tuple[bool, ...], ...]
 
     def over(self, dt: Tensor) -> Bonds:
         """The same with stiffness · dt; dt: (N,) h, alike in a colony."""
@@ -99,29 +141,44 @@ class Bonds:
         with torch.no_grad():
             nearest = CandidateContacts.all_of(self.begin, first, second).gap
             widest = torch.maximum(nearest, gap)
-        near = [widest < reach for reach in self.reaches]
-        held = (torch.where(x, p, 0.0) for x, p in zip(near, pairs.unbind(1), strict=True))
-        return functools.reduce(torch.add, held)  # in this order, whatever the batch
+        near = [widest < (reach if held[0] else -math.inf) for reach, held in self._kinds()]
+        return _sum_where(near, pairs)
+
+    def wall_stiffness(self, walls: WallContacts, gap: Tensor) -> Tensor:
+        """Of rows of cells and walls with these gaps as the step begins, (W,)."""
+        own = self.levels.index_select(0, walls.cell)
+        reaches = [[reach if h else -math.inf for h in held[1:]] for reach, held in self._kinds()]
+        reach = torch.tensor(reaches, device=gap.device).index_select(1, walls.surface)
+        return _sum_where((gap < reach).unbind(0), own[:, 0::2] * own[:, 1::2])
 
     @torch.no_grad()
-    def apart(self, drift: Tensor | None, groups: Groups) -> Tensor:
-        """The gap, µm, up to which pairs of each colony may hold each other, (B,), also where they
-        have drifted apart."""
-        reach = self.levels.new_full((groups.size,), max(self.reaches))
-        if drift is None:
-            return reach
-        dim = self.begin.centre.shape[0]
-        move, turn = (safe_norm(x.T.double()) for x in (drift[:, :dim], drift[:, dim:]))
-        return reach + 2.0 * groups.max(move + self.begin.half * turn)
+    def apart(self, drift: Tensor | None, groups: Groups) -> tuple[Tensor, Tensor]:
+        """The gaps, µm, up to which pairs of each colony may hold each other, and walls may hold
+        cells, (B,), also where they have drifted apart."""
+        cells = max((r for r, h in self._kinds() if h[0]), default=0.0)
+        walls = max((r for r, h in self._kinds() if any(h[1:])), default=0.0)
+        own = self.levels.new_zeros(groups.size)
+        if drift is not None:
+            dim = self.begin.centre.shape[0]
+            move, turn = (safe_norm(x.T.double()) for x in (drift[:, :dim], drift[:, dim:]))
+            own = groups.max(move + self.begin.half * turn)
+        return (cells + 2.0 * own) * (cells > 0), (walls + own) * (walls > 0)
+
+    def _kinds(self) -> list[tuple[float, tuple[bool, ...]]]:
+        """Reach of each kind, and what it holds."""
+        return list(zip(self.reaches, self.holds, strict=True))
+
+
+def _sum_where(near: Sequence[Tensor], values: Tensor) -> Tensor:
+    """The sum of the columns of values (P, K) where near (P,), in this order whatever the batch."""
+    parts = (torch.where(x, v, 0.0) for x, v in zip(near, values.unbind(1), strict=True))
+    return functools.reduce(torch.add, parts)
 
 
 @torch.no_grad()
 def _gap_at_begin(contacts: Contacts, now: Capsules, begin: Capsules) -> Tensor:
     """The gap of each row as the step began, (K,) µm, to first order in what has moved since."""
-    moved = torch.cat([
-        now.centre - begin.centre, cross(begin.axis, now.axis),
-        2.0 * (now.half - begin.half).unsqueeze(0),
-    ])  # fmt: skip
+    moved = _moved(now, begin)
     closed = (
         dot(row.T, moved.index_select(1, cell))
         for row, cell in (
@@ -130,6 +187,12 @@ def _gap_at_begin(contacts: Contacts, now: Capsules, begin: Capsules) -> Tensor:
         )
     )
     return contacts.gap + sum(closed)
+
+
+def _moved(now: Capsules, begin: Capsules) -> Tensor:
+    """How each cell has moved, turned and grown since the step began, (D, N)."""
+    grown = 2.0 * (now.half - begin.half).unsqueeze(0)
+    return torch.cat([now.centre - begin.centre, cross(begin.axis, now.axis), grown])
 
 
 def levels_of(
@@ -144,7 +207,10 @@ def levels_of(
             root if name is None else root * fields[name].double()
             for name in (kind.adhesin, kind.partner or kind.adhesin)
         )
-        levels += [adhesin if kind.partner else 0.5 * adhesin, partner]
+        if kind.to != "cells":  # a wall has a level of 1
+            levels += [adhesin, root]
+        else:
+            levels += [adhesin if kind.partner else 0.5 * adhesin, partner]
     return torch.stack(levels, 1)
 
 
@@ -152,6 +218,8 @@ def with_bonds(contacts: Contacts, bonds: Bonds, now: Capsules) -> Contacts:
     """The rows of contacts, and after them those that pull: one for each row at a contact. now:
     (N,) the cells."""
     assert contacts.beside is not None
+    if not any(between for between, *_ in bonds.holds):
+        return contacts
     gap = _gap_at_begin(contacts, now, bonds.begin)
     stiffness = bonds.stiffness(contacts.first, contacts.second, gap)
     (held,) = rows_where((stiffness.detach() != 0) & ~contacts.beside)
@@ -168,6 +236,24 @@ def with_bonds(contacts: Contacts, bonds: Bonds, now: Capsules) -> Contacts:
     )  # fmt: skip
 
 
+def with_wall_bonds(walls: WallContacts, bonds: Bonds, now: Capsules) -> WallContacts:
+    """The rows of cells at walls, and after them those that pull. now: (N,) the cells."""
+    if not any(any(of_walls) for _, *of_walls in bonds.holds):
+        return walls
+    with torch.no_grad():
+        share = walls.row[:, : now.centre.shape[0]].norm(dim=1)  # of the row in its contact
+        moved = _moved(now, bonds.begin).index_select(1, walls.cell)
+        gap = (walls.gap + dot(walls.row.T, moved)) / share
+    stiffness = bonds.wall_stiffness(walls, gap)
+    (held,) = rows_where(stiffness.detach() != 0)
+    pulling = walls.take(held)
+    return WallContacts(
+        torch.cat([walls.cell, pulling.cell]), torch.cat([walls.gap, -pulling.gap]),
+        torch.cat([walls.row, -pulling.row]), torch.cat([walls.surface, pulling.surface]),
+        torch.cat([torch.zeros_like(stiffness), stiffness.index_select(0, held)]),
+    )  # fmt: skip
+
+
 def roots_of(contacts: Contacts, alpha: Tensor) -> tuple[Tensor, Tensor]:
     """D of each row of two cells, (K, 1), and whether it pulls, (K,) bool. alpha: (N,)."""
     root, pull = contacts.weight.sqrt(), contacts.pull
@@ -177,3 +263,14 @@ def roots_of(contacts: Contacts, alpha: Tensor) -> tuple[Tensor, Tensor]:
     first, second = (alpha.index_select(0, x) for x in (contacts.first, contacts.second))
     held = safe_sqrt(0.5 * pull * (first + second)) + 0.0 * pull  # also what is not a number
     return torch.where(pulls, root * held, root).unsqueeze(1), pulls
+
+
+def wall_roots_of(
+    walls: WallContacts, root: Tensor, soft: Tensor, alpha: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The same D and softness of rows at walls, (W,), with those of rows that pull. alpha: (N,)."""
+    if walls.pull is None:
+        return root, soft
+    pulls = walls.pull.detach() != 0
+    held = safe_sqrt(walls.pull * alpha.index_select(0, walls.cell)) + 0.0 * walls.pull
+    return torch.where(pulls, held, root), soft | pulls

@@ -29,7 +29,7 @@ CELLS_A_THREAD = 1000
 DEGREES = {2: (0,) * 4, 3: (0,) * 8}
 
 # of cells that neither stick together nor move by themselves
-NOTHING = np.empty((0, 0)), np.empty(0), np.empty((0, 0))
+NOTHING = np.empty((0, 0)), np.empty(0), np.empty((0, 0)), np.empty((0, 1), np.bool_)
 
 # which kernels this process has called: type of settings, dimension, type of numbers
 _called: set[tuple[type, int, np.dtype]] = set()

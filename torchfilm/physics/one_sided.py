@@ -28,7 +28,7 @@ from torchfilm.kernels.scheme import (
     UNMOVED,
 )
 from torchfilm.physics import capsule
-from torchfilm.physics.adhesion import roots_of, with_bonds
+from torchfilm.physics.adhesion import roots_of, wall_roots_of, with_bonds, with_wall_bonds
 from torchfilm.physics.adjoint import attach_gradient
 from torchfilm.physics.contacts import CandidateContacts, Capsules
 from torchfilm.physics.jacobian import ContactJacobian
@@ -151,10 +151,10 @@ class _OneStep:
         local, axis = at.position - start.index_select(0, owner), at.axis.double()
         length, radius = at.length.double(), given.radius.double()
         margin = MARGIN * self.wide.index_select(0, owner)
-        apart = margin
+        apart = at_walls = margin
         if given.bonds is not None:
             held = given.bonds.apart(given.drift, self.groups)
-            apart = margin + held.index_select(0, owner)
+            apart, at_walls = (margin + x.index_select(0, owner) for x in held)
         pick = lambda x: x.detach().index_select(0, rows)
         near = Neighbourhood(
             pick(local), pick(axis), pick(length), pick(radius),
@@ -165,7 +165,7 @@ class _OneStep:
         capsules = Capsules(local.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius)
         found = CandidateContacts.all_of(capsules, first, second)
         last = at.move.detach()[:, : self.dim].double().square().sum(1).sqrt()
-        reach = margin + last if first_pass else margin
+        reach = at_walls + last if first_pass else at_walls
         position, axis, length, radius, ids, reach = (
             x.index_select(0, rows)
             for x in (at.position, axis, length, radius, given.colony_ids, reach)
@@ -210,7 +210,7 @@ class _OneStep:
                 own = (own * alpha.index_select(0, walls.cell)).sqrt()
                 soft = soft | here
             root = torch.where(here, own, root)
-        return root, soft
+        return wall_roots_of(walls, root, soft, alpha)
 
     # --- solve and move ------------------------------------------------------------------------
 
@@ -226,6 +226,7 @@ class _OneStep:
             half = torch.where(self.growth > 0, half, begin)  # the others are rigid
             now = Capsules(at.position.T, at.axis.double().T, half, given.radius)
             contacts = with_bonds(contacts, given.bonds, now)
+            walls = with_wall_bonds(walls, given.bonds, now)
         solved = self._solved(at, contacts, walls, moving, cells, active, least, first_pass)
         part, end = solved.problem, solved.end
         y = self._with_gradient(part, end)

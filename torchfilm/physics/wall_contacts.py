@@ -24,13 +24,15 @@ class WallContacts:
 
     cell: (W,). gap: (W,) µm. row: (W, D). surface: (W,) index of the touched surface. Where rows
     share one contact (see `find_wall_contacts`), gap and row of each are multiplied by the root of
-    its share.
+    its share. pull: (W,) stiffness · Δt of rows that pull (see `adhesion`), 0 of others; None if
+    there are none.
     """
 
     cell: Tensor
     gap: Tensor
     row: Tensor
     surface: Tensor
+    pull: Tensor | None = None
 
     def take(self, index: Tensor) -> WallContacts:
         """The rows at `index`."""
