@@ -8,7 +8,8 @@ import torch
 
 import torchfilm as tf
 from torchfilm.effects.bound_mechanics import BoundMechanics
-from torchfilm.tools import threads
+from torchfilm.physics import adjoint
+from torchfilm.tools import ragged, threads
 
 
 @pytest.fixture(autouse=True)
@@ -142,3 +143,28 @@ def test_work_in_few_parts_or_many_wakes_the_same_threads(monkeypatch):
     for count in (2, 3, 2, 3):
         threads.Shared()(count, lambda *_: used.add(threading.current_thread().name))
     assert len(used) <= 1 + 3 and len({name.rpartition("_")[0] for name in used}) == 2
+
+
+def test_the_way_back_through_contacts_and_sums_has_one_thread(monkeypatch):
+    """Of many small operations: torch's other threads would wait in a loop between them."""
+    seen: dict[str, set[int]] = {"contacts": set(), "sums": set()}
+    solve, add = adjoint.conjugate_gradients, ragged.Groups.sum
+
+    def solving(*given):
+        seen["contacts"].add(torch.get_num_threads())
+        return solve(*given)
+
+    def adding(self, value):
+        seen["sums"].add(torch.get_num_threads())
+        return add(self, value)
+
+    rate = torch.tensor(1.0, requires_grad=True)
+    cells = tf.Cells([[0.0, 0.0], [1.0, 0.9]], [[1.0, 0.0]] * 2, 2.0)
+    tight = tf.Mechanics(dim=2, tolerance=1e-5)
+    model = tf.Scene(tf.Growth(rate=rate), tight, founders=cells).bind()
+    state = model.step(model.step(model.start()))
+    monkeypatch.setattr(adjoint, "conjugate_gradients", solving)
+    monkeypatch.setattr(ragged.Groups, "sum", adding)
+    state.length.sum().backward()
+    assert seen == {"contacts": {1}, "sums": {1}} and torch.get_num_threads() == 3
+    assert rate.grad is not None and torch.isfinite(rate.grad)

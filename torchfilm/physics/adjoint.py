@@ -12,6 +12,7 @@ from torchfilm.physics.problem import ContactProblem
 from torchfilm.tools.cg import CGResult, conjugate_gradients, worst_of
 from torchfilm.tools.checks import SimulationError
 from torchfilm.tools.tangents import refuse_second
+from torchfilm.tools.threads import one_torch_thread
 
 
 def attach_gradient(
@@ -84,4 +85,5 @@ class _AdjointFunction(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad: Tensor):
         refuse_second("contacts")
-        return -ctx.solve_again(grad.contiguous()), None
+        with one_torch_thread():  # its many small operations would wait for others
+            return -ctx.solve_again(grad.contiguous()), None

@@ -21,6 +21,7 @@ from torchfilm.signals.transport_operator import Operator, apply
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.tangents import both, refuse_second, with_tangent
+from torchfilm.tools.threads import one_torch_thread
 
 Map = Callable[[Tensor], Tensor]
 # The residual allowed, relative to the norm of the right-hand side; and for each exchange of a
@@ -164,7 +165,7 @@ class _KrylovAdjoint(torch.autograd.Function):
             def left(x: Tensor) -> Tensor:
                 return torch.autograd.grad(value, at, x, retain_graph=True)[0]
 
-        with torch.no_grad():
+        with torch.no_grad(), one_torch_thread():
             first, of = torch.zeros_like(grad), ctx.of
             found, report = krylov(left, grad, first, symmetric, of.rounding, of.inverse)
         return (

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.tangents import both, in_forward_mode, refuse_second, with_tangent
+from torchfilm.tools.threads import one_torch_thread
 
 DEPTH, WORSE = 3, 4.0
 # Of the diagonal, added to it: differences may be parallel.
@@ -230,7 +231,8 @@ class _Adjoint(torch.autograd.Function):
             return grad + _zero_if_none(back, x)
 
         size = _sizes(grad, ctx.groups)
-        found = fixed_point(pulled, grad, lambda x, new: size, ctx.groups, close, most)
+        with one_torch_thread():
+            found = fixed_point(pulled, grad, lambda x, new: size, ctx.groups, close, most)
         return _nan_where(found.failed, found.x, ctx.groups), None, None, None, None
 
 

@@ -24,6 +24,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.tools.threads import one_torch_thread
+
 # The rows that one thread adds up in a sum over groups on CUDA.
 FAN = 32
 
@@ -284,7 +286,8 @@ class _GroupSpread(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad: Tensor):
-        return ctx.groups.sum(grad), None
+        with one_torch_thread():
+            return ctx.groups.sum(grad), None
 
     @staticmethod
     def jvp(ctx, tangent: Tensor, _):
