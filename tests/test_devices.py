@@ -12,23 +12,25 @@ from mock_cuda import pretended_cuda  # noqa: F401
 
 import torchfilm as tf
 
+# of each ready scene: long enough for cells to divide where they touch each other or walls
 STEPS = {
-    "microcolony": 60,
-    "channel": 60,
+    "microcolony": 40,
+    "channel": 40,
     "programmed_growth": 20,
-    "quorum_sensing": 8,
-    "boundary_detector": 8,
-    "synchronized_lysis": 8,
-    "strain_sorting": 20,
+    "quorum_sensing": 5,
+    "boundary_detector": 5,
+    "synchronized_lysis": 5,
+    "strain_sorting": 5,
     "random_partition": 8,
-    "nutrient_limited": 8,
+    "nutrient_limited": 5,
 }
+SMALL = {"strain_sorting": {"cells": 40, "chamber": 10.0}}
 
 
 def grown(name: str, device: str) -> tf.State:
     """Contacts by torch also on the CPU, as on CUDA: after many steps, the 1e-10 by which kernels
     differ (tests/physics/test_compiled.py) would hide what a device changes."""
-    scene = tf.scenes.build(name)
+    scene = tf.scenes.build(name, SMALL.get(name))
     if device == "cpu":
         by_torch = lambda e: replace(e, backend="torch") if isinstance(e, tf.Mechanics) else e
         scene = scene.replace(*(by_torch(e) for e in scene.effects))

@@ -23,7 +23,7 @@ def moved(value: float, *directions: float) -> torch.Tensor:
     return forward_ad.make_dual(torch.full_like(of, value), of)
 
 
-def replayed(scene: tf.Scene, dtype: torch.dtype = F64, cells: int = 12) -> dict[str, torch.Tensor]:
+def replayed(scene: tf.Scene, dtype: torch.dtype = F64, cells: int = 4) -> dict[str, torch.Tensor]:
     """Species and signals of two colonies on the same recorded growth, at the end."""
     model = scene.bind(2, streams=(0, 0), seed=4, dtype=dtype, per_colony=True)
     assert not model.why_not_replayable
