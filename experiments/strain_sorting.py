@@ -25,15 +25,6 @@ STRENGTHS, REPLICATES, SEED = (0.0, 20.0, 50.0, 300.0), 4, 0
 CONTACT = 0.1  # µm: surfaces that are nearer than this touch
 
 
-def alike(state: tf.State) -> torch.Tensor:
-    """The share of the contacts in each colony that are between cells of one strain, (B,)."""
-    first, second, _ = tf.measure.neighbours(state, CONTACT)
-    same = (state.cell_type[first] == state.cell_type[second]).double()
-    where = state.colony[first]
-    count = torch.bincount(where, minlength=state.colonies)
-    return torch.bincount(where, same, minlength=state.colonies) / count
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -47,7 +38,7 @@ def main() -> None:
     begun = time.perf_counter()
     for state in tf.simulate(scene, until=options.hours, colonies=len(each), seed=SEED):
         if state.step % 500 == 0:
-            shares = alike(state).view(-1, REPLICATES)
+            shares = tf.measure.alike_neighbours(state, CONTACT).view(-1, REPLICATES)
             both = zip(shares.mean(1).tolist(), shares.std(1).tolist(), strict=True)
             text = ", ".join(f"{mean:.2f} ± {spread:.2f}" for mean, spread in both)
             print(f"{state.time:4.1f} h: {text}")

@@ -135,19 +135,53 @@ def test_neighbours_within_no_such_gap_are_refused(gap):
     [
         "overlaps", "colony_centre", "colony_radius", "depth", "nematic_order", "tilt",
         "neighbours", "wall_forces", "growth_rates", "strains", "heterozygosity",
-        "pressure",
+        "pressure", "clusters", "alike_neighbours",
     ],
 )  # fmt: skip
 def test_a_measure_of_no_state_is_refused(name):
     measure = getattr(tf.measure, name)
     more = {
-        "neighbours": {"gap": 1.0}, "wall_forces": {"walls": [], "dt": 1.0},
+        "neighbours": {"gap": 1.0}, "clusters": {"gap": 1.0}, "alike_neighbours": {"gap": 1.0},
+        "wall_forces": {"walls": [], "dt": 1.0},
         "growth_rates": {"earlier": None}, "pressure": {"scene": None},
     }.get(name, {})  # fmt: skip
     with pytest.raises(tf.InputError, match=rf"{name}\(state\) = None.*a tf\.State"):
         measure(None, **more)
     with pytest.raises(tf.InputError, match=rf"{name} has no parameter 'unheard_of'"):
         measure(None, unheard_of=1)
+
+
+def test_clusters_hang_together_and_are_numbered_by_size():
+    """In a row: a pair, three apart by 0.05 µm each, one alone; the middle one of the three is of
+    another kind. The second colony has these three alone."""
+    ends = [0.0, 3.04, 9.0, 12.05, 15.1, 30.0]
+    cells = tf.Cells(
+        [[x, 0.0] for x in ends + ends[2:5]], [[1.0, 0.0]] * 9, 2.0,
+        cell_type=[0, 0, 0, 1, 0, 1, 0, 1, 0], colony=[0] * 6 + [1] * 3,
+    )  # fmt: skip
+    state = tf.Scene(tf.Growth(rate=1.0), founders=cells, dim=2).bind(2).start()
+    assert tf.measure.clusters(state, 0.1).tolist() == [1, 1, 0, 0, 0, 2, 0, 0, 0]
+    assert tf.measure.clusters(state, 0.045).tolist() == [0, 0, 1, 2, 3, 4, 0, 1, 2]
+    alike = tf.measure.clusters(state, 0.1, "cell_type")
+    assert alike.tolist() == [0, 0, 1, 2, 3, 4, 0, 1, 2]
+    assert tf.measure.alike_neighbours(state, 0.1).tolist() == pytest.approx([1 / 3, 0.0])
+    none = tf.measure.alike_neighbours(state, 0.01)
+    assert torch.isnan(none).all() and none.dtype == torch.float64
+    with pytest.raises(tf.InputError, match=r"clusters\(name\) = 'length'.*a field of the cells"):
+        tf.measure.clusters(state, 0.1, "length")
+
+
+def test_clusters_do_not_depend_on_the_batch():
+    scene = tf.Scene(tf.Growth(), founders=crowd(np.random.default_rng(7), 150, 2))
+    state = scene.bind(2).start()
+    state = state.replace(position=state.position * torch.linspace(1, 1.3, 300)[:, None])
+    for gap in (0.0, 0.2, 1.0):
+        found = tf.measure.clusters(state, gap)
+        assert torch.equal(found[150:], tf.measure.clusters(state.select([1]), gap))
+        sizes = torch.bincount(found[:150])
+        assert (sizes.diff() <= 0).all() and sizes.sum() == 150
+        first, second, _ = tf.measure.neighbours(state, gap)
+        assert torch.equal(found[first], found[second])
 
 
 @pytest.mark.parametrize("walls", [3, ["a"]])

@@ -317,3 +317,57 @@ def neighbours(state: State, gap: float) -> tuple[Tensor, Tensor, Tensor]:
     i, j = i.index_select(0, near), j.index_select(0, near)
     between = state.position.index_select(0, j) - state.position.index_select(0, i)
     return i, j, safe_norm(between.T)
+
+
+@of_a_state
+@torch.no_grad()
+def clusters(state: State, gap: float, name: str | None = None) -> Tensor:
+    """Which cluster each cell belongs to, (N,) int64: cells hang together where their surfaces are
+    less than `gap` µm apart. Clusters are numbered from 0 in each colony, the largest first, and of
+    equal ones that with the first cell.
+
+    name: a field of whole numbers, as for `strains`: then only cells of one kind hang together.
+    """
+    first, second, _ = neighbours(state, gap)
+    if name is not None:
+        kind = _kinds("clusters", state, name)
+        alike = kind[first] == kind[second]
+        first, second = first[alike], second[alike]
+    pairs = (torch.ones(len(first)).numpy(), (first.cpu().numpy(), second.cpu().numpy()))
+    of = torch.from_numpy(_hanging_together(pairs, state.cells)).to(state.device)
+    sizes = torch.bincount(of)
+    # their first cells: of several writes to one place torch keeps any, of a minimum the least
+    number = torch.arange(state.cells, device=state.device)
+    begin = number.new_full((len(sizes),), state.cells).scatter_reduce(0, of, number, "amin")
+    order = torch.argsort(begin, stable=True)
+    order = order[torch.argsort(sizes[order], descending=True, stable=True)]
+    order = order[torch.argsort(state.colony[begin[order]], stable=True)]
+    colony = state.colony[begin[order]]
+    place = torch.arange(len(order), device=state.device)
+    rank = torch.empty_like(place)
+    rank[order] = place - torch.searchsorted(colony, colony)
+    return rank[of]
+
+
+def _hanging_together(pairs: tuple[Any, tuple[Any, Any]], cells: int) -> Any:
+    """The number of the connected component of each cell, an array (N,) of int64."""
+    # imported where it is used: it takes longer to load than torchfilm itself
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    _, of = connected_components(coo_array(pairs, shape=(cells, cells)), directed=False)
+    return of.astype("int64")
+
+
+@of_a_state
+@torch.no_grad()
+def alike_neighbours(state: State, gap: float, name: str = "cell_type") -> Tensor:
+    """The share of a colony's pairs of neighbours, less than `gap` µm apart, that are of one kind:
+    (B,) float64, NaN without pairs. Kinds that are well mixed come to 1 − `heterozygosity`, but for
+    1/N, and kinds that have sorted to nearly 1. name: a field of whole numbers, as for `strains`.
+    """
+    kind = _kinds("alike_neighbours", state, name)
+    first, second, _ = neighbours(state, gap)
+    where = state.colony[first]
+    count = lambda x: torch.bincount(x, minlength=state.colonies).double()
+    return count(where[kind[first] == kind[second]]) / count(where)
