@@ -3,7 +3,8 @@ and write, that none is idle or comes too early, and that a run to a number of c
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -14,6 +15,9 @@ from torchfilm.rule_views import KNOWN_FIELDS, MEANS
 from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.warn_once import warn
+
+if TYPE_CHECKING:
+    from torchfilm.model import Model
 
 
 def check_names(effects: Sequence[BoundEffect], declared: Iterable[str], state: State) -> None:
@@ -194,3 +198,13 @@ def _check_adds(effects: Sequence[BoundEffect], state: State, cells: int) -> Non
         warn(f"{text} The run ends only if every such colony loses all cells. {hint}")
         return
     raise checks.InputError(f"{text} {hint}")
+
+
+def check_fits(state: object, model: Model, fields: Mapping[str, object]) -> None:
+    """Raise InputError if a step of this model cannot take the state, as far as a glance tells."""
+    if not isinstance(state, State):
+        hint = "Such as model.start(), or the last one of tf.simulate(…)."
+        raise checks.input_error("step(state)", state, "a tf.State", hint)
+    alike = state.dim == model.dim and state.dtype == model.batch.dtype
+    if not (alike and fields.keys() <= state.fields.keys()):
+        model.check(state)

@@ -96,6 +96,7 @@ class Model:
 
     def opened(self, state: State) -> State:
         """The state as a step of this model begins, also where another model made it."""
+        binding_checks.check_fits(state, self, self._first_fields)
         declared = {**state.declared, **self._first_fields}
         state = state.replace(births=(), ended=(), reports={}, declared=declared)
         for effect in self._openers:

@@ -345,6 +345,31 @@ def test_infinity_times_nothing_fails_too(backend):
     assert ["not finite" in failure.reason for failure in tf.failures(state)] == [True]
 
 
+@BACKENDS
+def test_levels_count_for_the_limit_of_strength(backend):
+    """1.1 times what is allowed fails the colony in its first step, and 0.9 times does not."""
+    for share, fails in ((0.9, False), (1.1, True)):
+        level = math.sqrt(share * 2.5e4 * 0.1 / 0.02 / 100.0)
+        cells = pair(0.05, extra={"a": [level, level]})
+        scene = stuck(cells, tf.Adhesion(100.0, adhesin="a"), backend=backend)
+        state = step(scene, scene.bind(dtype=torch.float64).start(), 0.02)
+        found = tf.failures(state)
+        assert bool(found) == fails
+        assert not fails or "stick together more strongly" in found[0].reason
+
+
+def test_the_limit_of_strength_holds_in_steps_and_for_all_kinds_together():
+    most = 2.5e4 * 0.1 / 0.02
+    model = stuck(pair(0.05), tf.Adhesion(1.1 * most)).bind()
+    for _ in range(2):
+        with pytest.raises(InputError, match="Adhesion.strength.*in steps of 0.02 h: solves"):
+            model.step(model.start())
+    assert model.step(model.start(), 0.01).step == 1
+    kinds = [tf.Adhesion(0.6 * most), tf.Adhesion(0.6 * most, 0.05 + 0.05)]
+    with pytest.raises(InputError, match="all kinds together"):
+        list(tf.simulate(stuck(pair(0.05), *kinds), until=0.1))
+
+
 def test_forward_mode_is_refused():
     scene = stuck(pair(0.05, extra={"a": [1.0, 1.0]}), tf.Adhesion(10.0, adhesin="a"))
     state = scene.bind(dtype=torch.float64).start()

@@ -18,7 +18,7 @@ from torchfilm.kernels import colonies, contacts, functions, lanes, moves, neigh
 from torchfilm.kernels.compiling import for_python
 from torchfilm.kernels.memory import no_memory
 from torchfilm.physics import substeps
-from torchfilm.physics.problem import BAD_DRAG, CONVERGED, NOT_FINITE, TOO_FAST
+from torchfilm.physics.problem import BAD_DRAG, BAD_LENGTH, CONVERGED, NOT_FINITE, TOO_FAST
 from torchfilm.tools.ragged import Groups
 
 KERNELS = "torchfilm.kernels."
@@ -189,9 +189,10 @@ def test_no_cells_come_nearer_than_told(dim, spread, own):
 
 
 def test_substeps_by_kernels_and_by_torch():
-    """Colonies that grow slowly, fast and too fast, with no number, without drag, and no cells."""
-    counts = [3, 4, 2, 3, 3, 0, 3, 2]
-    owner = torch.repeat_interleave(torch.arange(8), torch.tensor(counts))
+    """Colonies that grow slowly, fast and too fast, with no number, without drag, of a length below
+    0, and no cells."""
+    counts = [3, 4, 2, 3, 3, 0, 3, 2, 3]
+    owner = torch.repeat_interleave(torch.arange(9), torch.tensor(counts))
     count, generator = owner.numel(), torch.Generator().manual_seed(0)
     draw = lambda *shape: torch.rand(*shape, generator=generator) + 0.5
     position, axis, move = draw(count, 2).double(), draw(count, 2), draw(count, 4)
@@ -200,9 +201,10 @@ def test_substeps_by_kernels_and_by_torch():
     at = lambda colony: counts[:colony] and sum(counts[:colony])
     elongation[at(1)], elongation[at(2)] = 2.0, 1e6
     position[at(3), 1], move[at(4), 3] = torch.nan, torch.inf
-    viscosity[at(6)], length[at(7)] = 0.0, -torch.inf
+    viscosity[at(6)], length[at(7)], length[at(8) + 1] = 0.0, -torch.inf, -0.1
+    viscosity[at(8) + 2] = 0.0
     given = (position, axis, move, length, elongation, viscosity, length_drag)
-    found = substeps.substeps(Groups(owner, 8, ordered=True), *given, longest=0.5)
+    found = substeps.substeps(Groups(owner, 9, ordered=True), *given, longest=0.5)
     arrays = [x.numpy() for x in (position, axis, length, elongation, length, move)]
     drags = viscosity.numpy(), np.array([10.0], np.float32), np.empty(0, np.float32)
     begin = np.cumsum([0, *counts])
@@ -213,9 +215,9 @@ def test_substeps_by_kernels_and_by_torch():
         for first, end in pairwise(begin)
     ]
     assert list(zip(*(x.tolist() for x in found), strict=True)) == by_kernels
-    assert found[0].tolist() == [1, 4, 1, 1, 1, 1, 1, 1]
+    assert found[0].tolist() == [1, 4, 1, 1, 1, 1, 1, 1, 1]
     wanted = [CONVERGED] * 2 + [TOO_FAST] + [NOT_FINITE] * 2 + [CONVERGED, BAD_DRAG, NOT_FINITE]
-    assert found[1].tolist() == wanted
+    assert found[1].tolist() == [*wanted, BAD_LENGTH]
 
 
 def test_python_calls_only_kernels_that_have_a_form_for_it():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +18,7 @@ from torchfilm.physics.adhesion import Bonds, holds_of, levels_of
 from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.contacts import Capsules
 from torchfilm.physics.one_sided_records import OneSidedSettings
+from torchfilm.physics.problem import TOO_STICKY
 from torchfilm.physics.step_records import MechanicsInput
 from torchfilm.physics.surfaces import Surface
 from torchfilm.resolver import Resolved, snapshot
@@ -69,6 +71,7 @@ class BoundMechanics(BoundEffect):
         follows = self.compiled and effect.alpha is None and effect.stiffness is None
         self.alphas = compiled.alpha_arrays(None, None, dtype) if follows else None
         self.drifts = False
+        self.checked_dt: float | None = None  # h, of the last step whose adhesion was checked
 
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         self.drifts = any("drift" in effect.writes() for effect in effects)
@@ -112,20 +115,43 @@ class BoundMechanics(BoundEffect):
                 "Leave it out: by default contacts are as hard as they need be.",
             )
 
-    def _check_adhesion(self, dt: float) -> None:
-        """Raise InputError for bonds so stiff that solves would not converge."""
+    def _strongest(self, dt: float) -> list[float]:
+        """The strengths of the kinds of adhesion beyond which solves would not converge."""
         viscosity = self.effect.viscosity
         least = 1.0 if is_drawn(viscosity) else float(numbers(viscosity).min())
-        for kind in self.effect.adhesion:
-            most = STIFFEST * least * min(kind.reach, USUAL) / dt
+        return [STIFFEST * least * min(x.reach, USUAL) / dt for x in self.effect.adhesion]
+
+    def _check_adhesion(self, dt: float) -> None:
+        """Raise InputError for bonds so stiff that solves would not converge. Kinds add up."""
+        if self.checked_dt == dt:
+            return
+        total = 0.0
+        for kind, most in zip(self.effect.adhesion, self._strongest(dt), strict=True):
             strongest = float(numbers(kind.strength).max())
-            if most < strongest < math.inf:
+            total += strongest / most if strongest < math.inf else 0.0  # drawn: see `_stuck`
+            if total > 1.0:
+                others = "" if strongest > most else ", all kinds together"
                 raise checks.input_error(
                     "Adhesion.strength", strongest,
-                    f"at most {most:.3g} μ·µm²/h with this reach, in steps of {dt:g} h: solves for"
-                    " the contacts would not converge",
+                    f"at most {most:.3g} μ·µm²/h with this reach, in steps of {dt:g} h{others}:"
+                    " solves for the contacts would not converge",
                     "No cell pulls so hard; a tenth of it holds as well.",
                 )  # fmt: skip
+        self.checked_dt = dt
+
+    def _stuck(self, report: MechanicsReport, state: State, dt: float) -> MechanicsReport:
+        """The report, in which colonies fail whose cells stick together too strongly: by their
+        levels, or by strengths that were drawn."""
+        kinds = self.effect.adhesion
+        if not any(kind.levels or is_drawn(kind.strength) for kind in kinds):
+            return report
+        bonds = self._bonds(state, state.length)
+        assert bonds is not None
+        limits = bonds.levels.new_tensor(self._strongest(dt))
+        share = (bonds.most(state.groups) / limits).sum(1)
+        too_strong = ((share > 1.0) & (share < math.inf)).to(report.status.device)
+        status = torch.where(too_strong, TOO_STICKY, report.status)
+        return replace(report, status=status)
 
     @property
     def by_kernels(self) -> bool:
@@ -134,6 +160,7 @@ class BoundMechanics(BoundEffect):
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0:
             return state
+        self._check_adhesion(dt)
         if not self.derivatives_wanted(state) and self.compiled:
             length, growth = state.length, state.fields.get("elongation")
             growth = torch.zeros_like(length) if growth is None else growth
@@ -146,6 +173,7 @@ class BoundMechanics(BoundEffect):
         if found.contact_alpha is not None and found.compression is not None:
             fields |= {"contact_alpha": found.contact_alpha, "compression": found.compression}
         report = MechanicsReport(**vars(found.report), substeps=found.substeps)
+        report = self._stuck(report, state, dt)
         return state.with_fields(**fields).replace(
             position=found.position, axis=found.axis, length=found.length,
             reports={**state.reports, "mechanics": report},
@@ -181,6 +209,7 @@ class BoundMechanics(BoundEffect):
             given = self._given_alpha(state, dt, substeps)
             new["contact_alpha"] = found if given is None else given
         of_step = MechanicsReport(**vars(report), substeps=substeps)
+        of_step = self._stuck(of_step, state, dt)
         return state.with_fields(**new).replace(
             position=x, axis=axes, length=lengths,
             reports={**state.reports, "mechanics": of_step},

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchfilm.kernels.scheme import BURIED, LONG, MOST_SUBSTEPS
 from torchfilm.physics.contact_records import ContactReport
-from torchfilm.physics.problem import BAD_DRAG, COLLAPSED, STATUS, TOO_FAST
+from torchfilm.physics.problem import BAD_DRAG, BAD_LENGTH, COLLAPSED, STATUS, TOO_FAST, TOO_STICKY
 
 # What may help, by status; SOLVE for the others.
 SOLVE = (
@@ -16,6 +16,11 @@ SOLVE = (
     " a smaller strength, or lower levels of what multiplies it in both cells"
 )
 HINTS = {
+    TOO_STICKY: (
+        "Take a smaller strength, or lower levels of what multiplies it in both cells, or a smaller"
+        " dt"
+    ),
+    BAD_LENGTH: "Check what sets the lengths: a state that was changed, or an effect of your own",
     BAD_DRAG: "Check the effect or rule that sets the field drag",
     COLLAPSED: (
         "Take a smaller dt; leave alpha out, or take a smaller one where contacts give way too"
@@ -53,6 +58,13 @@ class MechanicsReport(ContactReport):
             return (
                 f"{int(self.deeply_overlapping[place])} cells lie deeper in others than a radius;"
                 f" for {LONG} steps it has been over {100 * BURIED:g} % of the cells"
+            )
+        if status == BAD_LENGTH:
+            return "the length of a cell is below 0"
+        if status == TOO_STICKY:
+            return (
+                "cells stick together more strongly than solves for the contacts allow: strength"
+                " times levels, as Adhesion.strength says of it"
             )
         return (
             f"the mechanics solve {STATUS[status]} after {int(self.iterations[place])} iterations,"

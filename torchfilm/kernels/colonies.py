@@ -27,6 +27,7 @@ from torchfilm.kernels.compiling import kernel, lean
 from torchfilm.kernels.memory import room
 from torchfilm.kernels.scheme import (
     BAD_DRAG,
+    BAD_LENGTH,
     BURIED,
     COLLAPSED,
     COMPRESSION,
@@ -80,7 +81,9 @@ def substeps(first, end, longest, cells, drags):
         viscosity, length_drag = viscosity_of(drags, i), value_of(drags[1], i)
         of_drags = (viscosity > 0) & (viscosity < np.inf) & (length_drag < np.inf)
         if not (of_drags & (length_drag > 0)):
-            status = BAD_DRAG
+            status = max(status, BAD_DRAG)
+        if -np.inf < length[i] < 0:
+            status = max(status, BAD_LENGTH)
         most = max(most, growth[i])
     wanted = math.ceil(most / longest * (1 - ROUNDING)) if status == CONVERGED else 1.0
     if wanted > MOST_SUBSTEPS:

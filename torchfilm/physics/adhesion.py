@@ -42,9 +42,9 @@ class Adhesion(metaclass=checks.KnownKeywords):
     Nearly parallel cells hold on at two places, each with half of the strength.
 
     adhesin: name of a species of a circuit, or of a variable of rules, that makes cells stick: the
-    pull is in proportion to the levels in both. partner: name of another one, to which the adhesin
-    binds instead of to itself: adhesin · partner, and partner · adhesin. With levels, `strength` is
-    that of a pair in which they are 1.
+    pull of a pair is strength · a₁ · a₂, their levels. partner: name of another one, to which the
+    adhesin binds instead of to itself: strength · (a₁ · p₂ + p₁ · a₂). Where that is more than a
+    strength may be, a colony fails.
 
     to: "cells"; "walls" for all walls of the same Mechanics; or one of them by its number, from 0.
     Each end of a cell sticks to a wall by itself, with the cell's own strength and level: one that
@@ -150,6 +150,14 @@ class Bonds:
         reaches = [[reach if h else -math.inf for h in held[1:]] for reach, held in self._kinds()]
         reach = torch.tensor(reaches, device=gap.device).index_select(1, walls.surface)
         return _sum_where((gap < reach).unbind(0), own[:, 0::2] * own[:, 1::2])
+
+    @torch.no_grad()
+    def most(self, groups: Groups) -> Tensor:
+        """A bound of the pull of each kind between cells of a colony, (B, K): stiffness · reach."""
+        columns = torch.stack([groups.max(x) for x in self.levels.unbind(1)], 1)
+        first, second = columns[:, 0::2], columns[:, 1::2]
+        pairs = 1.0 + torch.tensor([float(held[0]) for held in self.holds], device=first.device)
+        return pairs * first * second * first.new_tensor(self.reaches)
 
     @torch.no_grad()
     def apart(self, drift: Tensor | None, groups: Groups) -> tuple[Tensor, Tensor]:

@@ -10,11 +10,13 @@ import torch
 from torch import Tensor
 
 from torchfilm.kernels.scheme import BAD_DRAG as BAD_DRAG
+from torchfilm.kernels.scheme import BAD_LENGTH as BAD_LENGTH
 from torchfilm.kernels.scheme import COLLAPSED as COLLAPSED
 from torchfilm.kernels.scheme import CONVERGED as CONVERGED
 from torchfilm.kernels.scheme import ITERATION_LIMIT as ITERATION_LIMIT
 from torchfilm.kernels.scheme import NOT_FINITE as NOT_FINITE
 from torchfilm.kernels.scheme import TOO_FAST as TOO_FAST
+from torchfilm.kernels.scheme import TOO_STICKY as TOO_STICKY
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.tools.ragged import Groups
 
@@ -25,6 +27,8 @@ STATUS = {
     TOO_FAST: "would have to follow too much growth in one step",
     BAD_DRAG: "has a drag that is not above 0 and finite",
     COLLAPSED: "leaves too many cells deep in others, step after step",
+    BAD_LENGTH: "has a cell whose length is below 0",
+    TOO_STICKY: "has cells that stick together too strongly",
 }
 
 

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchfilm.kernels.scheme import (
     BAD_DRAG,
+    BAD_LENGTH,
     CONVERGED,
     MOST_SUBSTEPS,
     NOT_FINITE,
@@ -43,4 +44,5 @@ def substeps(
     status = torch.where(steps > MOST_SUBSTEPS, TOO_FAST, CONVERGED)
     status = torch.where(broken, NOT_FINITE, status)
     status = torch.where(no_drag, BAD_DRAG, status)
+    status = torch.where(groups.any((length < 0) & (length > -torch.inf)), BAD_LENGTH, status)
     return torch.where(status == CONVERGED, steps.clamp(min=1), 1).long(), status

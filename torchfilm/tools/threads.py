@@ -82,6 +82,7 @@ def one_torch_thread() -> Iterator[None]:
     searches do so by themselves. It makes no difference to kernels; large sums of torch itself may
     differ in their last bits. A thread of Python that first uses torch meanwhile has one, too.
     """
+    after_fork()
     if _given.count is not None or torch.get_num_threads() == 1:
         yield  # the default of threads to come stays as it is
         return
