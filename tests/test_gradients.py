@@ -443,3 +443,14 @@ def test_second_derivatives_through_equal_steps_are_right():
     differences = (slope(2.0 + 1e-4)[1] - slope(2.0 - 1e-4)[1]) / 2e-4
     assert float(second) == pytest.approx(float(differences), rel=1e-6)
     assert abs(float(second)) > 1e-3
+
+
+def test_a_rate_laid_without_gradients_carries_none():
+    """A view that is made in no_grad would say that it requires one, and hold a dead graph."""
+    rate = torch.tensor(1.0, dtype=F64, requires_grad=True)
+    model = tf.Scene(tf.Growth(rate=rate), dim=2, dt=0.05).bind(dtype=F64)
+    with torch.no_grad():
+        state = model.start()
+    assert not model.step(state).length.requires_grad
+    (slope,) = torch.autograd.grad(model.step(model.start()).length.sum(), rate)
+    assert slope > 0

@@ -25,6 +25,11 @@ wanted = run()
 model = scene.bind(colonies=30)
 first = model.start()
 child = os.fork()
+if child == 0 and sys.argv[1] == "bind":
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        made = scene.bind(colonies=2).start()
+    os._exit(0 if made.cells == 2 and torch.get_num_threads() == 1 else 3)
 if child == 0 and sys.argv[1] == "step":
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -44,7 +49,7 @@ sys.exit(os.waitstatus_to_exitcode(status))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks")
-@pytest.mark.parametrize("how", ["run", "step"])
+@pytest.mark.parametrize("how", ["run", "step", "bind"])
 def test_a_fork_computes_in_one_thread_and_says_so(how):
     done = subprocess.run([sys.executable, "-c", FORKED, how], capture_output=True, timeout=120)
     assert done.returncode == 0, done.stderr.decode()

@@ -100,18 +100,20 @@ class WallForces:
 
 @of_a_state
 @torch.no_grad()
-def wall_forces(state: State, walls: Sequence[Wall] | Scene, dt: float) -> WallForces:
+def wall_forces(state: State, walls: Sequence[Wall] | Scene, dt: float | None = None) -> WallForces:
     """The forces on walls in the last step, of dt hours, by one-sided contacts.
 
     A contact pushes with its overlap / (α Δt), on a soft wall with its overlap × stiffness. Divide
     by the length of a wall (2-D) or its area for the pressure, averaged over steps: one step's is
-    as exact as its solve. walls: those of the scene's Mechanics, whose stiffness is not drawn; or
-    the scene, with which the pull of `tf.Adhesion` to walls counts: a force below 0.
+    as exact as its solve. walls: the scene; or the walls of its Mechanics, whose stiffness is not
+    drawn, with the dt. Only with the scene the pull of `tf.Adhesion` to walls counts, a force below
+    0; that of bonds that broke in this step does not. dt: h, by default that of the scene.
     """
     from torchfilm.scene import Scene  # it imports rooms that measure
 
     if isinstance(walls, Scene):
         bonds, surfaces = bonds_of(state, walls), _surfaces_of(walls)
+        dt = walls.dt if dt is None else dt
     else:
         _check_walls("wall_forces", walls)
         bonds, surfaces = None, [s for wall in walls for s in wall.surfaces(state.dim)]
@@ -137,6 +139,7 @@ def pressure(state: State, scene: Scene, dt: float | None = None) -> Tensor:
     over the share of the chamber that the cells fill. Overlaps give the forces with an error of
     second order in dt: in a full chamber, where cells still shift, 5 % at 0.025 h, 0.5 % at
     0.00625 h. Adhesion pulls: where it does so more than contacts push, the pressure is below 0.
+    Bonds that broke in this step do not count.
     dt: of the last step, h; by default that of the scene.
 
     Raises InputError for bilateral contacts, and for a state that is not as a step returned it: it

@@ -278,7 +278,7 @@ class State:
         row_checks.check_fields(self.fields, scopes, self._rows)
 
     def declare(self, field: Field) -> State:
-        """A state that has one more field, at its initial value."""
+        """A state with one more field, at its first value; in no_grad views keep no dead graph."""
         if not isinstance(field, Field):
             raise checks.input_error("field", field, "a tf.Field(…)")
         declared = self.replace(declared={**self.declared, field.name: field})
@@ -293,6 +293,7 @@ class State:
             raise checks.input_error(
                 f"initial value of {field.name}", tuple(start.shape), f"of {rows} rows"
             )
+        start = start.detach() if start.requires_grad and not torch.is_grad_enabled() else start
         return declared.with_fields(**{field.name: start})
 
     def cell_columns(self) -> dict[str, Tensor]:

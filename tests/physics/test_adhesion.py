@@ -362,7 +362,7 @@ def test_the_limit_of_strength_holds_in_steps_and_for_all_kinds_together():
     most = 2.5e4 * 0.1 / 0.02
     model = stuck(pair(0.05), tf.Adhesion(1.1 * most)).bind()
     for _ in range(2):
-        with pytest.raises(InputError, match="Adhesion.strength.*in steps of 0.02 h: solves"):
+        with pytest.raises(InputError, match=r"Adhesion.strength.*in steps of 0.02 h: solves"):
             model.step(model.start())
     assert model.step(model.start(), 0.01).step == 1
     kinds = [tf.Adhesion(0.6 * most), tf.Adhesion(0.6 * most, 0.05 + 0.05)]

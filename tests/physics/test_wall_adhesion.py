@@ -119,9 +119,7 @@ def test_a_cell_leaves_a_wall_that_it_pulls_hard_enough(backend, strength, holds
         assert height(state, stands=True) > 5.0
         return
     assert height(state, stands=True) == pytest.approx(0.15, rel=1e-3)
-    assert tf.measure.wall_forces(state, scene, 0.01).force.tolist() == [
-        [pytest.approx(-30.0, rel=1e-3)]
-    ]
+    assert tf.measure.wall_forces(state, scene).force.tolist() == [[pytest.approx(-30.0, rel=1e-3)]]
     assert tf.measure.wall_forces(state, [floor()], 0.01).force.tolist() == [[0.0]]
     # −30 at the end of a cell, over twice its area from above
     pressure = -30.0 * (1.5 + 0.15) / (2 * (2.0 + np.pi / 4))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from weakref import ref
 
 import torch
@@ -29,6 +30,7 @@ from torchfilm.state import GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.reads import reads_are_free
 from torchfilm.tools.row_checks import check_signals
+from torchfilm.tools.warn_once import warn
 
 if TYPE_CHECKING:
     from torchfilm.effects.medium import Medium
@@ -227,9 +229,37 @@ class GridCoverage(_MediumPart):
         super().__init__(effect, binding, transport)
         self.stage, self.title = GRID_COVERAGE, "grid coverage"
         flat = [count == 1 for count in effect.voxels]  # a box of one layer stays one layer
-        fixed = [letter not in effect.grows for letter in "xyz"]
-        self.flat, self.fixed = torch.tensor([flat, fixed], device=binding.batch.device)
+        self.flat = torch.tensor(flat, device=binding.batch.device)
+        self.fixed = torch.tensor(fixed_faces(effect.grows), device=binding.batch.device)
         self._seen: ref[Grid] | None = None  # the grid that was checked last
+
+    def check_others(self, effects: Sequence[BoundEffect]) -> None:
+        """Warn where the box would grow through a wall."""
+        if self.effect.outside != "grow":
+            return
+        surfaces = [s for e in effects for s in e.effect.wall_surfaces()]
+        walls: dict[str, float] = {}
+        low, high = (~self.fixed & ~self.flat).tolist()
+        for sign, moves, face in zip("-+", (low, high), self.effect.box, strict=True):
+            found = walls_at(surfaces, 1.0 if sign == "-" else -1.0, face, self.effect.spacing)
+            walls |= {sign + "xyz"[k]: x for k, x in found if moves[k]}
+        if walls:
+            self._warn_of(walls, *(~self.fixed).tolist())
+
+    def _warn_of(self, walls: Mapping[str, float], low: list[bool], high: list[bool]) -> None:
+        """walls: where they are, by the faces of the box. low, high: which faces may move."""
+        left = {
+            a: "".join(s for s, moves in (("-", lo), ("+", hi)) if moves and s + a not in walls)
+            for a, lo, hi in zip("xyz", low, high, strict=True)
+        }
+        grows = "".join("" if not s else a if s == "-+" else s + a for a, s in left.items())
+        at = ", ".join(f"{face[1]} = {x:g} µm" for face, x in walls.items())
+        hint = f"grows={grows!r}" if grows else "outside='error'"
+        warn(
+            f"Medium(outside='grow'): the box grows through the wall at {at}, with new medium"
+            f" behind it, at its first concentration. With {hint} it stays at the wall.",
+            of="Medium.grows",
+        )
 
     def reads(self) -> tuple[str, ...]:
         return ("position", *self.writes())
@@ -295,7 +325,8 @@ class GridCoverage(_MediumPart):
         low, high = spans(state.position_3d, state.groups)
         margin = (MARGIN * layout.grid.step).masked_fill(self.flat, 0.0)
         low, high = low - margin, high + margin
-        return low.masked_fill(self.fixed, torch.inf), high.masked_fill(self.fixed, -torch.inf)
+        fixed_low, fixed_high = self.fixed
+        return low.masked_fill(fixed_low, torch.inf), high.masked_fill(fixed_high, -torch.inf)
 
     def _grown(self, state: State) -> State:
         layout = state.layout
@@ -327,6 +358,30 @@ class GridCoverage(_MediumPart):
                 for n, v, start in zip(names, values, first, strict=True)
             }
         )
+
+
+def walls_at(
+    surfaces: Sequence[Any], facing: float, corner: Sequence[float], spacing: Sequence[float]
+) -> list[tuple[int, float]]:
+    """The axes along which a flat wall is within a voxel of this corner of a box, with the cells on
+    the side `facing`, 1 or −1; and where it is, µm."""
+    found = []
+    for surface in surfaces:
+        normal = getattr(surface, "normal", None)
+        if normal is None or isinstance(surface.offset, Tensor):
+            continue
+        for k, (x, voxel) in enumerate(zip(corner, spacing, strict=False)):
+            # a vector of unit length
+            if k < len(normal) and not isinstance(normal[k], Tensor) and normal[k] == facing:
+                place = facing * surface.offset
+                found += [(k, place)] if abs(place - x) <= voxel else []
+    return found
+
+
+def fixed_faces(grows: str) -> list[list[bool]]:
+    """Of x, y and z whether the lower, and whether the higher face of a box stays: (2, 3)."""
+    faces = re.findall("[+-]?[xyz]", grows)
+    return [[not {axis, sign + axis} & {*faces} for axis in "xyz"] for sign in "-+"]
 
 
 class DaughtersCoverage(_MediumPart):

@@ -3,8 +3,9 @@ equations 6 and 7)."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -21,7 +22,7 @@ from torchfilm.effects.bound_medium import (
 from torchfilm.effects.medium_transport import EXACT, Transport
 from torchfilm.effects.signal import Flow, Signal, check_boundary, velocity
 from torchfilm.parameters import number_range
-from torchfilm.signals.boundary_conditions import BoundaryConditions, Open
+from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.exchange import turns_error
 from torchfilm.signals.schedule import Schedule, each_value
 from torchfilm.signals.space import check_used, checked_box
@@ -53,8 +54,9 @@ class Medium(Effect):
     bool, true where there is no medium.
 
     outside: the meaning of cells outside the box. "error": the colony fails. "grow": the box grows
-    with its colony, along the axes in `grows`. "reservoir": around the box each signal has its
-    `reservoir` concentration; the fields NAME_reservoir sum what cells give to it, less what they
+    with its colony, along the axes in `grows`; with "xy+z" the lower face of z stays, such as at a
+    wall on which cells grow. "reservoir": around the box each signal has its `reservoir`
+    concentration; the fields NAME_reservoir sum what cells give to it, less what they
     take.
 
     exchange: how circuits and the medium exchange signals. "together": circuits and transport of
@@ -140,6 +142,10 @@ class Medium(Effect):
         }
         for name, value in given.items():
             object.__setattr__(self, name, value)
+        if all(self.flow_of(name) is None for name in signals):  # no face is open by default
+            still = {name: replace(s, boundary=_still(s.boundary)) for name, s in signals.items()}
+            object.__setattr__(self, "boundary", _still(self.boundary))
+            object.__setattr__(self, "signals", still)
         self._check_periodic()
         check_used(self)
 
@@ -160,14 +166,8 @@ class Medium(Effect):
 
     def boundary_of(self, name: str) -> BoundaryConditions:
         """The boundary conditions of a signal."""
-        signal = self.signals[name]
-        if signal.boundary is not None or self.boundary is not None:
-            return signal.boundary or self.boundary or BoundaryConditions()
-        return (
-            BoundaryConditions()
-            if self.flow_of(name) is None
-            else BoundaryConditions(Open(), Open(), Open())
-        )
+        given = self.signals[name].boundary or self.boundary or BoundaryConditions()
+        return given if self.flow_of(name) is None else given.in_flow()
 
     def flow_of(self, name: str) -> Flow | Schedule:
         """The velocity that carries a signal, or None."""
@@ -382,6 +382,11 @@ def _check_signals(signals: Mapping[str, Any]) -> None:
             )
 
 
+def _still(boundary: BoundaryConditions | None) -> BoundaryConditions | None:
+    """The faces of a medium that does not flow, all of them said."""
+    return None if boundary is None else BoundaryConditions(*boundary.pairs)
+
+
 def _check_medium(
     boundary: object,
     outside: str,
@@ -393,9 +398,11 @@ def _check_medium(
 ) -> None:
     check_boundary("Medium.boundary", boundary)
     checks.choice("Medium.outside", outside, OUTSIDE_CELLS)
-    if not isinstance(grows, str) or not grows or set(grows) - set("xyz"):
+    if not isinstance(grows, str) or not re.fullmatch("([+-]?[xyz])+", grows):
         raise checks.input_error(
-            "Medium.grows", grows, 'some of the letters x, y and z, such as "x"'
+            "Medium.grows",
+            grows,
+            'some of the letters x, y and z, with a sign for one face alone, such as "xy+z"',
         )
     if method is not None:
         checks.choice("Medium.method", method, tuple(METHODS))

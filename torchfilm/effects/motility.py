@@ -42,7 +42,10 @@ class MotilityReport:
     uid: Tensor
     move: Tensor
     turn: Tensor
-    hint = "A smaller dt or speed may help (speeds are per hour, and dt is in hours)"
+    hint = (
+        "A smaller dt, speed or turning may help (they are per hour, and dt is in hours): the same"
+        " turn moves the ends of longer cells farther"
+    )
 
     def reason(self, place: int) -> str:
         """What went wrong in the colony at this place of the batch."""

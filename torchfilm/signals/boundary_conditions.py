@@ -79,18 +79,21 @@ class Open(Face):
 
 @dataclass(frozen=True)
 class BoundaryConditions(metaclass=checks.KnownKeywords):
-    """The six faces of a box: for each axis one face for both ends, or (low, high).
+    """The six faces of a box: for each axis one face for both ends, or (low, high). The faces of an
+    axis that is left out are `NoFlux()`, or `Open()` where the medium flows.
 
     Example: `BoundaryConditions(x=(Dirichlet(1.0), Open()), y=Periodic())`.
     """
 
-    x: Face | tuple[Face, Face] = NoFlux()
-    y: Face | tuple[Face, Face] = NoFlux()
-    z: Face | tuple[Face, Face] = NoFlux()
+    x: Face | tuple[Face, Face] | None = None
+    y: Face | tuple[Face, Face] | None = None
+    z: Face | tuple[Face, Face] | None = None
 
     def __post_init__(self) -> None:
         for axis in AXES:
             given = getattr(self, axis)
+            if given is None:
+                continue
             pair = (given, given) if isinstance(given, Face) else given
             if not (
                 isinstance(pair, (tuple, list))
@@ -114,8 +117,14 @@ class BoundaryConditions(metaclass=checks.KnownKeywords):
 
     @property
     def pairs(self) -> tuple[tuple[Face, Face], tuple[Face, Face], tuple[Face, Face]]:
-        """(low, high) along x, y and z."""
-        return self.x, self.y, self.z  # type: ignore[return-value]
+        """(low, high) along x, y and z, of a medium that does not flow."""
+        of = lambda given: (NoFlux(), NoFlux()) if given is None else given
+        return of(self.x), of(self.y), of(self.z)
+
+    def in_flow(self) -> BoundaryConditions:
+        """The same of a medium that flows."""
+        of = lambda given: Open() if given is None else given
+        return BoundaryConditions(of(self.x), of(self.y), of(self.z))
 
     @property
     def periodic(self) -> tuple[bool, bool, bool]:

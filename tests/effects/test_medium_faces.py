@@ -1,0 +1,98 @@
+"""Faces of a medium: those that nobody names, in a flow, and those that stay where a box grows."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+import torch
+
+import torchfilm as tf
+
+BOX = [[-16.0, -16.0, 0.0], [16.0, 16.0, 40.0]]
+FOOD = {"food": tf.Signal(diffusion=1e3, initial=1.0), "spacing": 4.0}
+
+
+def still(medium: tf.Medium, **given) -> tf.Scene:
+    cells = tf.Cells([[0.0, 0.0, 4.0]], [[1.0, 0.0, 0.0]])
+    return tf.Scene(tf.Growth(rate=0.0), medium, founders=cells, **({"dim": 3} | given))
+
+
+@pytest.mark.parametrize("where", ["medium", "signal"])
+def test_in_a_flow_the_faces_that_nobody_names_are_open(where):
+    """A flow along x, and faces along z alone: what comes in is the medium outside, which is
+    empty, and what goes out is what was inside."""
+    faces = tf.BoundaryConditions(z=(tf.NoFlux(), tf.NoFlux()))
+    given = {"boundary": faces} if where == "medium" else {}
+    food = tf.Signal(0.0, initial=1.0, boundary=None if given else faces)
+    medium = tf.Medium(food=food, box=BOX, spacing=4.0, flow=(32.0, 0.0, 0.0), **given)
+    *_, state = tf.simulate(still(medium), until=0.5, dt=0.05)
+    assert float(state.signals["food"].max()) <= 1.0 + 1e-5
+    assert float(state.signals["food"].mean()) == pytest.approx(0.5, abs=0.05)
+    closed = tf.BoundaryConditions(x=tf.NoFlux(), z=(tf.NoFlux(), tf.NoFlux()))
+    medium = tf.Medium(food=tf.Signal(0.0, initial=1.0), box=BOX, spacing=4.0,
+                       flow=(32.0, 0.0, 0.0), boundary=closed)  # fmt: skip
+    *_, state = tf.simulate(still(medium), until=0.5, dt=0.05)
+    assert float(state.signals["food"].mean()) == pytest.approx(1.0, rel=1e-5)
+
+
+def test_without_a_flow_they_are_closed():
+    """And the description of the scene is that of all faces said."""
+    some = tf.Medium(**FOOD, box=BOX, boundary=tf.BoundaryConditions(z=tf.Dirichlet(1.0)))
+    every = tf.BoundaryConditions(tf.NoFlux(), tf.NoFlux(), tf.Dirichlet(1.0))
+    said = tf.Medium(**FOOD, box=BOX, boundary=every)
+    assert some.boundary_of("food") == every and still(some).listing() == still(said).listing()
+
+
+@pytest.mark.parametrize(
+    ("grows", "low", "high"),
+    [
+        ("xyz", [-1, -1, -1], [1, 1, 1]),
+        ("xy+z", [-1, -1, 0], [1, 1, 1]),
+        ("-x", [-1, 0, 0], [0, 0, 0]),
+        ("+x-xz", [-1, 0, -1], [1, 0, 1]),
+    ],
+)
+def test_faces_that_are_not_named_stay(grows, low, high):
+    """Cells near all six faces; the box grows by blocks of 32 µm where it may."""
+    box = [[-16.0] * 3, [16.0] * 3]
+    ends = torch.eye(3, dtype=torch.float64) * 15.0
+    cells = tf.Cells(torch.cat([ends, -ends]), [[1.0, 0.0, 0.0]] * 6, 0.5)
+    medium = tf.Medium(**FOOD, box=box, outside="grow", grows=grows)
+    *_, state = tf.simulate(tf.Scene(tf.Growth(rate=0.0), medium, founders=cells, dim=3), until=0.1)
+    grid = state.layout.grid
+    assert grid.origin[0].tolist() == [-16.0 + 32.0 * x for x in low]
+    assert grid.high[0].tolist() == [16.0 + 32.0 * x for x in high]
+
+
+@pytest.mark.parametrize(
+    ("walls", "given", "words"),
+    [
+        ([tf.Plane(z=0.0, facing="+z")], {}, r"at z = 0 µm.*grows='xy\+z'"),
+        ([tf.Plane(z=0.0, facing="+z")], {"grows": "xyz"}, r"grows='xy\+z'"),
+        ([tf.Plane(z=1.0, facing="+z"), tf.Plane(x=16.0, facing="-x")], {}, r"grows='-xy\+z'"),
+        ([tf.Plane(z=0.0, facing="+z")], {"grows": "xy+z"}, None),
+        ([tf.Plane(z=0.0, facing="+z")], {"outside": "error"}, None),
+        ([tf.Plane(z=-20.0, facing="+z")], {}, None),
+        ([tf.Plane(z=41.0, facing="-z")], {"grows": "+z"}, "outside='error'"),
+    ],
+)
+def test_a_box_that_grows_through_a_wall_is_warned_of(walls, given, words):
+    medium = tf.Medium(**FOOD, box=BOX, **({"outside": "grow"} | given))
+    scene = tf.Scene(
+        tf.Growth(rate=0.0), tf.Mechanics(dim=3, walls=walls), medium,
+        founders=tf.Cells([[0.0, 0.0, 4.0]], [[1.0, 0.0, 0.0]]),
+    )  # fmt: skip
+    if words is None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            scene.bind()
+        return
+    with pytest.warns(UserWarning, match="grows through the wall.*" + words):
+        scene.bind()
+
+
+@pytest.mark.parametrize("grows", ["", "xy+", "w", "z-", 3])
+def test_faces_that_there_are_not_are_refused(grows):
+    with pytest.raises(tf.InputError, match=r"Medium\.grows = .*such as \"xy\+z\""):
+        tf.Medium(**FOOD, box=BOX, outside="grow", grows=grows)
