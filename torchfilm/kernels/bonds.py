@@ -190,11 +190,7 @@ def _weight(H, h, i, scale, dof):
 
 
 @lean
-def room_of_bonds(bonds, pairs, walls):
-    """How many rows there may be of so many rows of pairs and of walls, with those that pull."""
-    holds, most = bonds[5], pairs + walls
-    if holds[:, :1].any():
-        most += pairs
-    if holds[:, 1:].any():
-        most += walls
-    return most
+def room_of_bonds(reach, pairs, walls):
+    """How many rows there may be of so many rows of pairs and of walls, with those that pull.
+    reach: as `reach_of` says, above 0 where something holds."""
+    return pairs * (2 if reach[0] > 0 else 1) + walls * (2 if reach[1] > 0 else 1)

@@ -79,12 +79,14 @@ DEEP, TOLERANCE, MOST_PASSES, LIMIT, SOFT, YIELD = range(6)
 
 
 @lean
-def _wall_contacts(memory, x, axis, half, radius, scale, at, found, bonds, like, dof):
+def _wall_contacts(memory, x, axis, half, radius, scale, at, found, reached, like, dof):
     """Rows (H, gaps, one, two, soft) of cells at walls, with room for those of the contacts
-    `found` and of `bonds`; how many there are, and the deepest gap. at: the walls, and weight and
-    reach by cell."""
+    `found` and of bonds; how many there are, and the deepest gap. at: the walls, and weight and
+    reach by cell. reached: the reaches of bonds."""
     (kinds, places, sizes, is_soft, _), root, reach = at
-    most = room_of_bonds(bonds, most_rows(dof) * found[4].shape[0], 3 * kinds.shape[0] * x.shape[0])
+    most = room_of_bonds(
+        reached, most_rows(dof) * found[4].shape[0], 3 * kinds.shape[0] * x.shape[0]
+    )
     rows = room_for_rows(memory, most, like, dof)
     walls, deepest = wall_rows(
         x, axis, half, radius, scale, kinds, places, sizes, root, reach, rows, is_soft, False, dof,
@@ -178,7 +180,7 @@ def _arrays(memory, length, growth, shortest, last, roots):
 
 @lean
 def _prepared(memory, x, axis, growth, radius, drag, last, first_pass, rising, hardness, softer,
-              walls, alphas, bonds, margin, found, arrays, dof):  # fmt: skip
+              walls, alphas, reached, margin, found, arrays, dof):  # fmt: skip
     """Puts what a pass starts from into its arrays. Returns rows of cells at walls, with room for
     those of `found`, how many there are, and the deepest gap."""
     length, least, half, (reach, root), (alpha, low), scale, y, _, _ = arrays
@@ -189,7 +191,7 @@ def _prepared(memory, x, axis, growth, radius, drag, last, first_pass, rising, h
         alphas, margin, alpha, low, reach, root, dof,
     )  # fmt: skip
     at = walls, root, reach
-    return _wall_contacts(memory, x, axis, half, radius, scale, at, found, bonds, last, dof)
+    return _wall_contacts(memory, x, axis, half, radius, scale, at, found, reached, last, dof)
 
 
 @lean
@@ -214,7 +216,7 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
         give_back(memory, top)  # the contacts are kept, not what was made of them
         rows, at_walls, deepest = _prepared(
             memory, x, axis, growth, radius, drag, last, number == 0, rising, hardness[0], softer,
-            walls, alphas, bonds, margin + reach[1], found, arrays, dof,
+            walls, alphas, reach, margin + reach[1], found, arrays, dof,
         )  # fmt: skip
         if number > 0 and not deeply:  # cells do not lie deep in others; but in a wall?
             if deepest >= -deep:
@@ -224,7 +226,7 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
             continue
         error, e, m = _solved(
             memory, x, axis, radius, found, rows, at_walls, deep, margin, number, arrays, bonds,
-            2 * target, settings, report, team, dof,
+            reach, 2 * target, settings, report, team, dof,
         )  # fmt: skip
         failed = error > tolerance and error < np.inf
         if failed and rising and softer < MOST_SOFTER:
@@ -282,8 +284,8 @@ def _carried_out(memory, x, axis, radius, last, gaps, walls, margin, number, arr
 
 
 @lean
-def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, number, arrays, bonds, cap,
-            settings, report, team, dof):  # fmt: skip
+def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, number, arrays, bonds,
+            reach, cap, settings, report, team, dof):  # fmt: skip
     """Solve a pass, of which `walls` rows are made: the first for all cells, a later one for those
     that lie deep and those near them. Returns the error, each row's gap after the move, and how
     many rows there are."""
@@ -297,11 +299,10 @@ def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, number, a
         )
     else:
         m = pair_rows(memory, x, axis, half, radius, scale, mine, walls, rows, far, dof)
-    if bonds[1].shape[0]:
-        if bonds[5][:, 0].any():
-            m = add_bonds(rows, walls, m, x, axis, half, radius, scale, bonds, alpha, dof)
-        if walls > 0 and bonds[5][:, 1:].any():
-            m = add_wall_bonds(rows, walls, m, x, axis, half, root, scale, bonds, alpha, dof)
+    if reach[0] > 0:
+        m = add_bonds(rows, walls, m, x, axis, half, radius, scale, bonds, alpha, dof)
+    if reach[1] > 0:
+        m = add_wall_bonds(rows, walls, m, x, axis, half, root, scale, bonds, alpha, dof)
     error, e = _minimise_some(
         memory, rows, m, numbers, count, alpha, low, y, cap, settings, report, team, dof
     )
