@@ -141,3 +141,11 @@ def test_all_have_the_same_columns():
 
     with pytest.raises(tf.InputError, match=r"columns cell_type, position; founders\(0\) gave"):
         scene(odd).bind(2)
+
+
+def test_a_gradient_that_founders_lose_is_warned_of():
+    place = torch.zeros(1, 2, requires_grad=True)
+    with pytest.warns(UserWarning, match=r"Cells\.position requires a gradient.*first state"):
+        cells = tf.Cells(place, [[1.0, 0.0]])
+    state = tf.Scene(tf.Growth(rate=1.0), founders=cells, dim=2).bind().start()
+    assert state.replace(position=place.double()).position.requires_grad

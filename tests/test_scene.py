@@ -437,3 +437,15 @@ def test_a_step_goes_forwards(dt):
     model = tf.Scene(tf.Growth(rate=1.0), dim=2).bind()
     with pytest.raises(tf.InputError, match=r"^dt = "):
         model.step(model.start(), dt)
+
+
+@pytest.mark.parametrize("stage", [None, "late", True])
+def test_a_stage_that_is_no_number_is_refused(stage):
+    given = stage
+
+    @dataclass(frozen=True)
+    class Mine(Effect):
+        stage, title = given, "mine"
+
+    with pytest.raises(tf.InputError, match=r"Mine\.stage = .*a number"):
+        tf.Scene(Mine())

@@ -15,6 +15,7 @@ from torchfilm.physics.contacts import gaps_nearby
 from torchfilm.physics.walls import Wall
 from torchfilm.state import CELL_TYPE, RESERVED, Field, State
 from torchfilm.tools import checks, displays
+from torchfilm.tools.row_checks import without_gradient
 from torchfilm.tools.tables import Table
 from torchfilm.tools.warn_once import warn
 
@@ -412,9 +413,8 @@ def _colonies(numbers: np.ndarray, most: int = 12) -> str:
 def _array(name: str, given: Any, dtype: type) -> np.ndarray:
     """An array of finite numbers, or InputError."""
     try:
-        values: np.ndarray = np.asarray(
-            given.detach().cpu() if isinstance(given, Tensor) else given, dtype=dtype
-        )
+        given = without_gradient(f"Cells.{name}", given)
+        values: np.ndarray = np.asarray(given, dtype=dtype)
     except (TypeError, ValueError) as error:
         raise checks.input_error(f"Cells.{name}", given, "an array of numbers") from error
     bad = np.argwhere(~np.isfinite(values))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from numbers import Real
 from typing import Any, ClassVar
 
 import torch
@@ -268,6 +269,8 @@ def _check_effects(effects: Sequence[Any]) -> None:
                     f"{type(effect).__name__} has no {what}: give the class one, such as {what} ="
                     f" {example}."
                 )
+        if isinstance(effect.stage, bool) or not isinstance(effect.stage, Real):
+            raise checks.input_error(f"{type(effect).__name__}.stage", effect.stage, "a number")
     titles = [e.title for e in effects]
     for effect in effects:
         count = titles.count(effect.title)

@@ -468,3 +468,14 @@ def test_one_number_of_all_cells_is_refused_where_cells_divide(ask):
     with pytest.raises(tf.InputError, match=r"test_rules\.py, line \d+ .*torch\.where"):
         tf.Scene(tf.Rules(update), tf.Growth(), tf.Division()).bind().start()
     assert tf.Scene(tf.Rules(update), tf.Growth()).bind().start().cells == 1
+
+
+def test_a_rule_that_returns_values_is_refused():
+    """They would be lost: rules write to the cells."""
+
+    def update(cells):
+        return {"growth_rate": cells.growth_rate * 2}
+
+    words = r"update returns values by name, \['growth_rate'\].*cells\.growth_rate = "
+    with pytest.raises(tf.InputError, match=words):
+        tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), dim=2).bind()

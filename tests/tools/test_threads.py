@@ -99,7 +99,7 @@ def test_a_rule_has_the_threads_of_torch_and_kernels_leave_it_one(monkeypatch):
 
     def rule(cells):
         seen["rule"] = torch.get_num_threads()
-        return {"growth_rate": cells.growth_rate}
+        cells.growth_rate = cells.growth_rate * 1.0
 
     parted = BoundMechanics.parted
 

@@ -367,18 +367,23 @@ def own_draws(label: str) -> Iterator[None]:
         )
 
 
-def act(rule: Callable[..., None], *views: CellsView | DivisionView) -> None:
+def act(rule: Callable[..., object], *views: CellsView | DivisionView) -> None:
     """Calls a rule on its views. Raises RuleError, with the line, if it uses a tensor as one
-    number, or calls a function with what that does not take. Errors of other kinds are raised as
-    they are."""
+    number, or calls a function with what that does not take, or if it returns values by name, which
+    would be lost. Errors of other kinds are raised as they are."""
     try:
-        rule(*views)
+        returned = rule(*views)
     except (RuntimeError, ValueError, TypeError) as error:
         hint = next((words for part, words in HINTS.items() if part in str(error)), "")
         own = isinstance(error, checks.InputError) or not isinstance(error, (ValueError, TypeError))
         if own and not hint:
             raise
         raise RuleError(f"{_line_of(error, rule)}: {hint or _first_line(error)}") from error
+    if isinstance(returned, Mapping):
+        raise RuleError(
+            f"{label_of(rule)} returns values by name, {list(returned)}: write them to the cells"
+            " instead, such as cells.growth_rate = …"
+        )
     for view in views:
         view.check_unharmed()
 

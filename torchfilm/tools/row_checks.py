@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.tools import checks
+from torchfilm.tools.warn_once import warn
 
 WHOLE = (torch.int64, torch.int32)  # of which torch takes rows
 
@@ -198,3 +199,15 @@ def check_variable(label: str, name: str, state: Any, at_least_zero: bool = Fals
 
 def _rule(count: int) -> str:
     return f"a 1-D tensor of whole numbers from 0 to {count - 1}, the rows of cells"
+
+
+def without_gradient(name: str, given: Any) -> Any:
+    """What is given for founders, tensors on the CPU; warns where a gradient is lost."""
+    if not isinstance(given, Tensor):
+        return given
+    if given.requires_grad:
+        warn(
+            f"{name} requires a gradient, which founders do not keep. Put it into the first state:"
+            " state.replace(position=…) or state.with_fields(…), before the first step."
+        )
+    return given.detach().cpu()
