@@ -345,7 +345,7 @@ def _variable(name: str, value: Tensor) -> Field:
     return known or Field(name, MEANING, dtype=value.dtype, shape=tuple(value.shape[1:]))
 
 
-def label_of(rule: Callable[..., None]) -> str:
+def label_of(rule: Callable[..., object]) -> str:
     """A label that gives each rule its own random numbers."""
     return (
         f"rule {getattr(rule, '__module__', '')}"
@@ -388,7 +388,7 @@ def act(rule: Callable[..., object], *views: CellsView | DivisionView) -> None:
         view.check_unharmed()
 
 
-def _line_of(error: Exception, rule: Callable[..., None]) -> str:
+def _line_of(error: Exception, rule: Callable[..., object]) -> str:
     """The innermost line of the user's that led to an error; the rule, where there is none."""
     found = [
         f
