@@ -28,6 +28,16 @@ def test_dense_cells_find_room(dim, count, radius):
     assert np.linalg.norm(cells.position, axis=1).max() <= radius
 
 
+def test_cells_lie_on_a_floor():
+    cells = tf.inoculum(40, radius=12.0, dim=3, floor=-1.0, cell_radius=0.4, colonies=2, seed=5)
+    flat = tf.inoculum(40, radius=12.0, cell_radius=0.4, colonies=2, seed=5)
+    assert (cells.position[:, 2] == -0.6).all() and (cells.axis[:, 2] == 0.0).all()
+    assert np.array_equal(cells.position[:, :2], flat.position) and cells.overlaps() == []
+    wall = tf.Plane(z=-1.0, facing="+z")
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=3, walls=[wall]), founders=cells)
+    assert float(tf.measure.overlaps(scene.bind(2).start(), [wall]).walls.max()) < 1e-6
+
+
 def test_shares_of_types():
     cells = tf.inoculum(31, radius=30.0, types={0: 0.9, 2: 0.1}, colonies=5, seed=1)
     kinds = cells.cell_type.reshape(5, 31)
@@ -66,6 +76,8 @@ def test_colonies_grow_from_it():
         ({"radius": 2.0}, "30 cells of length 2 and radius 0.5 µm would fill 426% of it, and"),
         ({"count": 0}, "count = 0"),
         ({"dim": 4}, "dim = 4"),
+        ({"floor": 0.0}, "floor = 0.0 .*left out with dim=2"),
+        ({"dim": 3, "floor": np.inf}, "floor = inf"),
         ({"colonies": 0}, "colonies = 0"),
         ({"length": -1.0}, "length = -1"),
         ({"fractions": {0: 1.0}}, "no parameter 'fractions'"),

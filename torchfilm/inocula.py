@@ -24,6 +24,7 @@ def inoculum(
     dim: int = 2,
     length: float = 2.0,
     cell_radius: float = 0.5,
+    floor: float | None = None,
     seed: int = 0,
 ) -> Cells:
     """Founders at random places and in random directions, `count` in each of some colonies.
@@ -33,7 +34,8 @@ def inoculum(
     radius: of the disc, in 3-D the ball, that contains their centres, µm. types: the share of each
     cell type, which together are 1; each colony has these shares, as near as whole numbers of cells
     come to them, and who is of which type is drawn. dim: 2 or 3. length: of the centreline, µm;
-    cell_radius: µm. No two cells overlap. Colony k is the same whatever the number of colonies.
+    cell_radius: µm. floor: in 3-D, µm: cells lie flat on a floor at this z, in a disc around the z
+    axis, instead of in a ball. No two cells overlap. Colony k is the same whatever the number of colonies.
     Raises InputError for shares that do not sum to 1, and where the cells do not find room: rods
     placed one after the other at random fill at most about 45 % of an area, 30 % of a volume.
     """
@@ -44,11 +46,17 @@ def inoculum(
     checks.number("length", length, least=0.0)
     checks.number("cell_radius", cell_radius, above=0.0)
     checks.integer("seed", seed, least=0)
-    shares = _shares(types)
+    if floor is not None:
+        checks.number("floor", floor)
+        if dim == 2:
+            raise checks.input_error("floor", floor, "left out with dim=2", "Take dim=3.")
+    shares, placed_in = _shares(types), 2 if floor is not None else dim
     made = [
-        _colony(np.random.default_rng([seed, k]), count, radius, dim, length, cell_radius)
+        _colony(np.random.default_rng([seed, k]), count, radius, placed_in, length, cell_radius)
         for k in range(colonies)
     ]
+    if floor is not None:
+        made = [_lying(*placed, floor + cell_radius) for placed in made]
     kinds = [_types(np.random.default_rng([seed, k, 1]), count, shares) for k in range(colonies)]
     return Cells(
         np.concatenate([position for position, _ in made]),
@@ -117,6 +125,12 @@ def _filled(count: int, radius: float, dim: int, length: float, cell_radius: flo
         return count * (across + around) / (np.pi * (radius + cell_radius) ** 2)
     volume = around * (length + 4.0 / 3.0 * cell_radius)
     return count * volume / (4.0 / 3.0 * np.pi * (radius + cell_radius) ** 3)
+
+
+def _lying(position: np.ndarray, axis: np.ndarray, z: float) -> tuple[np.ndarray, np.ndarray]:
+    """Cells of the plane in space, at this height."""
+    column = np.full((len(position), 1), z)
+    return np.hstack([position, column]), np.hstack([axis, 0.0 * column])
 
 
 def _overlapping(
