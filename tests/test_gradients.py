@@ -27,9 +27,11 @@ from differences import (
     scattered,
     seeded,
 )
+from torch.autograd import forward_ad
 
 import torchfilm as tf
 from torchfilm.kernels.scheme import SHRINK
+from torchfilm.tools.tangents import forward_mode, tangent
 
 MODES = [pytest.param({"contacts": c}, id=c) for c in ("bilateral", "one-sided")]
 
@@ -454,3 +456,7 @@ def test_a_rate_laid_without_gradients_carries_none():
     assert not model.step(state).length.requires_grad
     (slope,) = torch.autograd.grad(model.step(model.start()).length.sum(), rate)
     assert slope > 0
+    with torch.no_grad(), forward_mode():
+        dual = forward_ad.make_dual(rate, torch.ones_like(rate))
+        model = tf.Scene(tf.Growth(rate=dual), dim=2, dt=0.05).bind(dtype=F64)
+        assert float(tangent(model.step(model.start()).length).sum()) == pytest.approx(float(slope))

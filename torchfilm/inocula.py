@@ -35,7 +35,7 @@ def inoculum(
     cell type, which together are 1; each colony has these shares, as near as whole numbers of cells
     come to them, and who is of which type is drawn. dim: 2 or 3. length: of the centreline, µm;
     cell_radius: µm. floor: in 3-D, µm: cells lie flat on a floor at this z, in a disc around the z
-    axis, instead of in a ball. No two cells overlap. Colony k is the same whatever the number of colonies.
+    axis, instead of in a ball. No two cells overlap. Colony k is the same whatever their number.
     Raises InputError for shares that do not sum to 1, and where the cells do not find room: rods
     placed one after the other at random fill at most about 45 % of an area, 30 % of a volume.
     """

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchfilm.physics import capsule
 from torchfilm.signals.layout import Contact, Layout, Signals
-from torchfilm.tools import checks, displays, random, row_checks
+from torchfilm.tools import checks, displays, random, row_checks, tangents
 from torchfilm.tools.ragged import Groups, offsets
 from torchfilm.tools.read_only import read_only
 
@@ -293,7 +293,7 @@ class State:
             raise checks.input_error(
                 f"initial value of {field.name}", tuple(start.shape), f"of {rows} rows"
             )
-        start = start.detach() if start.requires_grad and not torch.is_grad_enabled() else start
+        start = start.detach() if tangents.graph_is_dead(start) else start
         return declared.with_fields(**{field.name: start})
 
     def cell_columns(self) -> dict[str, Tensor]:

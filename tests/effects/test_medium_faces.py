@@ -73,7 +73,9 @@ def test_faces_that_are_not_named_stay(grows, low, high):
         ([tf.Plane(z=1.0, facing="+z"), tf.Plane(x=16.0, facing="-x")], {}, r"grows='-xy\+z'"),
         ([tf.Plane(z=0.0, facing="+z")], {"grows": "xy+z"}, None),
         ([tf.Plane(z=0.0, facing="+z")], {"outside": "error"}, None),
-        ([tf.Plane(z=-20.0, facing="+z")], {}, None),
+        ([tf.Plane(z=-20.0, facing="+z")], {}, r"at z = -20 µm.*grows='xy\+z'"),
+        ([tf.Plane(z=-40.0, facing="+z")], {}, None),
+        ([tf.Plane(z=20.0, facing="-z")], {}, None),
         ([tf.Plane(z=41.0, facing="-z")], {"grows": "+z"}, "outside='error'"),
     ],
 )

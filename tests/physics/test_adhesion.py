@@ -358,16 +358,42 @@ def test_levels_count_for_the_limit_of_strength(backend):
         assert not fails or "stick together more strongly" in found[0].reason
 
 
-def test_the_limit_of_strength_holds_in_steps_and_for_all_kinds_together():
+def test_the_limit_of_strength_holds_in_steps():
     most = 2.5e4 * 0.1 / 0.02
     model = stuck(pair(0.05), tf.Adhesion(1.1 * most)).bind()
     for _ in range(2):
         with pytest.raises(InputError, match=r"Adhesion.strength.*in steps of 0.02 h: solves"):
             model.step(model.start())
     assert model.step(model.start(), 0.01).step == 1
-    kinds = [tf.Adhesion(0.6 * most), tf.Adhesion(0.6 * most, 0.05 + 0.05)]
-    with pytest.raises(InputError, match="all kinds together"):
-        list(tf.simulate(stuck(pair(0.05), *kinds), until=0.1))
+    assert model.step(model.start(), 0.0).step == 1
+
+
+@BACKENDS
+def test_what_two_cells_or_a_cell_and_a_wall_share_counts_for_the_limit(backend):
+    """Kinds add up where they hold the same cell; of a partner what some cell has; 0.9 times the
+    limit runs, and 1.1 times fails."""
+    most = 2.5e4 * 0.1 / 0.02
+    for share, fails in ((0.9, False), (1.1, True)):
+        half = 0.5 * share * most
+        level = math.sqrt(2.0 * half / 100.0)
+        pairs = {"a": [level, 0.0], "p": [0.0, level]}
+        hetero = tf.Adhesion(100.0, adhesin="a", partner="p")
+        floor, side = tf.Plane(y=-9.0, facing="+y"), tf.Plane(x=-9.0, facing="+x")
+        to_each = [tf.Adhesion(2 * half, to=k) for k in (0, 1)]
+        for cells, kinds, counts in (
+            (pair(0.05), [tf.Adhesion(half), tf.Adhesion(half, 0.05 + 0.05)], True),
+            (pair(0.05, extra=pairs), [hetero], True),
+            (pair(0.05, cell_type=[0, 1]),
+             [tf.Adhesion({0: 2 * half if k == 0 else 0.0, 1: 2 * half if k else 0.0})
+              for k in (0, 1)], None),
+            (pair(0.05), to_each, None),
+            (pair(0.05), [tf.Adhesion(half, to="walls"), tf.Adhesion(half, to=0)], True),
+        ):  # fmt: skip
+            scene = stuck(cells, *kinds, backend=backend, walls=[floor, side])
+            if counts is None and fails:
+                continue  # a strength above the limit is refused by itself
+            state = step(scene, scene.bind(dtype=torch.float64).start(), 0.02)
+            assert bool(tf.failures(state)) == (fails and bool(counts))
 
 
 def test_forward_mode_is_refused():

@@ -62,6 +62,12 @@ def test_beyond_its_reach_an_end_is_free(backend):
         state = step(scene, scene.bind(dtype=torch.float64).start(), 0.02)
         assert (height(state) < gap - 0.01) == moves
         assert moves or height(state) == pytest.approx(gap, abs=1e-9)
+    for reach in (0.1, 0.3, 0.7):
+        for side in (-1e-9, 1e-9):
+            kind = tf.Adhesion(5.0, reach, to="walls")
+            scene = at_walls(above(reach + side), kind, walls=[floor()], backend=backend)
+            state = step(scene, scene.bind(dtype=torch.float64).start(), 0.02)
+            assert (height(state) < reach - 0.001) == (side < 0), (reach, side)
     far = at_walls(above(2.4), tf.Adhesion(12.5, 2.5, to=0), walls=[floor()], backend=backend)
     state = step(far, far.bind(dtype=torch.float64).start(), 0.02)
     assert height(state) == pytest.approx(2.4 / (1 + 2 * 5 * 0.02 / 3), rel=1e-5)

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.mechanics_report import MechanicsReport
 from torchfilm.physics import capsule, compiled, torch_step
-from torchfilm.physics.adhesion import Bonds, holds_of, levels_of
+from torchfilm.physics.adhesion import Bonds, holds_of, levels_of, most_of_limits
 from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.contacts import Capsules
 from torchfilm.physics.one_sided_records import OneSidedSettings
@@ -119,36 +119,34 @@ class BoundMechanics(BoundEffect):
         """The strengths of the kinds of adhesion beyond which solves would not converge."""
         viscosity = self.effect.viscosity
         least = 1.0 if is_drawn(viscosity) else float(numbers(viscosity).min())
-        return [STIFFEST * least * min(x.reach, USUAL) / dt for x in self.effect.adhesion]
+        most = STIFFEST * least / dt if dt > 0 else math.inf
+        return [most * min(kind.reach, USUAL) for kind in self.effect.adhesion]
 
     def _check_adhesion(self, dt: float) -> None:
-        """Raise InputError for bonds so stiff that solves would not converge. Kinds add up."""
+        """Raise InputError for bonds so stiff that solves would not converge."""
         if self.checked_dt == dt:
             return
-        total = 0.0
         for kind, most in zip(self.effect.adhesion, self._strongest(dt), strict=True):
             strongest = float(numbers(kind.strength).max())
-            total += strongest / most if strongest < math.inf else 0.0  # drawn: see `_stuck`
-            if total > 1.0:
-                others = "" if strongest > most else ", all kinds together"
+            if most < strongest < math.inf:
                 raise checks.input_error(
                     "Adhesion.strength", strongest,
-                    f"at most {most:.3g} μ·µm²/h with this reach, in steps of {dt:g} h{others}:"
-                    " solves for the contacts would not converge",
+                    f"at most {most:.3g} μ·µm²/h with this reach, in steps of {dt:g} h: solves for"
+                    " the contacts would not converge",
                     "No cell pulls so hard; a tenth of it holds as well.",
                 )  # fmt: skip
         self.checked_dt = dt
 
-    def _stuck(self, report: MechanicsReport, state: State, dt: float) -> MechanicsReport:
+    def _stuck(
+        self, report: MechanicsReport, state: State, levels: Tensor, dt: float
+    ) -> MechanicsReport:
         """The report, in which colonies fail whose cells stick together too strongly: by their
-        levels, or by strengths that were drawn."""
+        levels, by strengths that were drawn, or by several kinds together. levels: of the step."""
         kinds = self.effect.adhesion
-        if not any(kind.levels or is_drawn(kind.strength) for kind in kinds):
+        if len(kinds) < 2 and not any(kind.levels or is_drawn(kind.strength) for kind in kinds):
             return report
-        bonds = self._bonds(state, state.length)
-        assert bonds is not None
-        limits = bonds.levels.new_tensor(self._strongest(dt))
-        share = (bonds.most(state.groups) / limits).sum(1)
+        limits = [x / kind.reach for x, kind in zip(self._strongest(dt), kinds, strict=True)]
+        share = most_of_limits(levels.detach(), self.holds, limits, state.groups)
         too_strong = ((share > 1.0) & (share < math.inf)).to(report.status.device)
         status = torch.where(too_strong, TOO_STICKY, report.status)
         return replace(report, status=status)
@@ -166,14 +164,16 @@ class BoundMechanics(BoundEffect):
             growth = torch.zeros_like(length) if growth is None else growth
             dtype = state.radius.dtype
             return self.parted(state, dt, *(as_array(x, dtype) for x in (growth, length)))
-        found = torch_step.step(self._given(state, dt))
+        given = self._given(state, dt)
+        found = torch_step.step(given)
         fields = {"displacement": found.move, "collapsed_steps": found.collapsed}
         if "elongation" in state.fields:
             fields["elongation"] = found.elongation
         if found.contact_alpha is not None and found.compression is not None:
             fields |= {"contact_alpha": found.contact_alpha, "compression": found.compression}
         report = MechanicsReport(**vars(found.report), substeps=found.substeps)
-        report = self._stuck(report, state, dt)
+        if given.bonds is not None:
+            report = self._stuck(report, state, given.bonds.levels, dt)
         return state.with_fields(**fields).replace(
             position=found.position, axis=found.axis, length=found.length,
             reports={**state.reports, "mechanics": report},
@@ -196,9 +196,10 @@ class BoundMechanics(BoundEffect):
             as_array(fields["collapsed_steps"], torch.int64), alpha, compression,
         )  # fmt: skip
         walls = compiled.wall_arrays(*self._surfaces(state), state.colony_id, state.cells)
+        bonds = self._bond_arrays(state, length, growth)
         made, report, substeps = compiled.step(
             self.settings, state.groups, dt, self.effect.max_elongation, cells, self._drags(state),
-            self._alphas(state), walls, self._bond_arrays(state, length, growth),
+            self._alphas(state), walls, bonds,
         )  # fmt: skip
         x, axes, lengths, moves, growths, fallen, *of_contacts = map(torch.from_numpy, made)
         new = {"displacement": moves, "collapsed_steps": fallen}
@@ -209,7 +210,9 @@ class BoundMechanics(BoundEffect):
             given = self._given_alpha(state, dt, substeps)
             new["contact_alpha"] = found if given is None else given
         of_step = MechanicsReport(**vars(report), substeps=substeps)
-        of_step = self._stuck(of_step, state, dt)
+        if self.effect.adhesion:
+            assert bonds is not None
+            of_step = self._stuck(of_step, state, torch.from_numpy(bonds[0]), dt)
         return state.with_fields(**new).replace(
             position=x, axis=axes, length=lengths,
             reports={**state.reports, "mechanics": of_step},

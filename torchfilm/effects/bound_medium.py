@@ -257,7 +257,7 @@ class GridCoverage(_MediumPart):
         hint = f"grows={grows!r}" if grows else "outside='error'"
         warn(
             f"Medium(outside='grow'): the box grows through the wall at {at}, with new medium"
-            f" behind it, at its first concentration. With {hint} it stays at the wall.",
+            f" behind it, at its first concentration. Let the box end at the wall, with {hint}.",
             of="Medium.grows",
         )
 
@@ -363,8 +363,9 @@ class GridCoverage(_MediumPart):
 def walls_at(
     surfaces: Sequence[Any], facing: float, corner: Sequence[float], spacing: Sequence[float]
 ) -> list[tuple[int, float]]:
-    """The axes along which a flat wall is within a voxel of this corner of a box, with the cells on
-    the side `facing`, 1 or −1; and where it is, µm."""
+    """The axes along which a box may grow through a flat wall from this corner, with the cells on
+    the side `facing`, 1 or −1, and where the wall is, µm: up to a voxel inside, or a block outside.
+    """
     found = []
     for surface in surfaces:
         normal = getattr(surface, "normal", None)
@@ -374,7 +375,8 @@ def walls_at(
             # a vector of unit length
             if k < len(normal) and not isinstance(normal[k], Tensor) and normal[k] == facing:
                 place = facing * surface.offset
-                found += [(k, place)] if abs(place - x) <= voxel else []
+                beyond = facing * (x - place) / voxel
+                found += [(k, place)] if -1.0 <= beyond < BLOCK else []
     return found
 
 

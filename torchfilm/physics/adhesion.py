@@ -148,16 +148,8 @@ class Bonds:
         """Of rows of cells and walls with these gaps as the step begins, (W,)."""
         own = self.levels.index_select(0, walls.cell)
         reaches = [[reach if h else -math.inf for h in held[1:]] for reach, held in self._kinds()]
-        reach = torch.tensor(reaches, device=gap.device).index_select(1, walls.surface)
+        reach = self.levels.new_tensor(reaches).index_select(1, walls.surface)
         return _sum_where((gap < reach).unbind(0), own[:, 0::2] * own[:, 1::2])
-
-    @torch.no_grad()
-    def most(self, groups: Groups) -> Tensor:
-        """A bound of the pull of each kind between cells of a colony, (B, K): stiffness · reach."""
-        columns = torch.stack([groups.max(x) for x in self.levels.unbind(1)], 1)
-        first, second = columns[:, 0::2], columns[:, 1::2]
-        pairs = 1.0 + torch.tensor([float(held[0]) for held in self.holds], device=first.device)
-        return pairs * first * second * first.new_tensor(self.reaches)
 
     @torch.no_grad()
     def apart(self, drift: Tensor | None, groups: Groups) -> tuple[Tensor, Tensor]:
@@ -181,6 +173,23 @@ def _sum_where(near: Sequence[Tensor], values: Tensor) -> Tensor:
     """The sum of the columns of values (P, K) where near (P,), in this order whatever the batch."""
     parts = (torch.where(x, v, 0.0) for x, v in zip(near, values.unbind(1), strict=True))
     return functools.reduce(torch.add, parts)
+
+
+@torch.no_grad()
+def most_of_limits(
+    levels: Tensor, holds: Sequence[Sequence[bool]], limits: Sequence[float], groups: Groups
+) -> Tensor:
+    """A bound of the stiffness between two cells, or at a surface, of each colony, (B,), over its
+    limit; that of several kinds adds up. levels, holds: as of `Bonds`. limits: of each kind."""
+    at = [torch.zeros_like(levels[:, 0]) for _ in holds[0]]  # of cells, and of each surface
+    for k, (held, limit) in enumerate(zip(holds, limits, strict=True)):
+        first, second = levels[:, 2 * k] / limit, levels[:, 2 * k + 1]
+        if held[0]:
+            most = [groups.max(x).index_select(0, groups.owner) for x in (first, second)]
+            at[0] = at[0] + first * most[1] + second * most[0]
+        for surface, holding in enumerate(held[1:], 1):
+            at[surface] = at[surface] + first * second if holding else at[surface]
+    return groups.max(functools.reduce(torch.maximum, at))
 
 
 @torch.no_grad()

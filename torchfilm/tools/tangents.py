@@ -60,6 +60,12 @@ def tangent(value: Tensor) -> Tensor | None:
     return forward_ad.unpack_dual(value).tangent
 
 
+def graph_is_dead(x: Tensor) -> bool:
+    """Whether a tensor made in no_grad says that it requires a gradient, as a view does, whose
+    graph leads nowhere. One with a tangent does not count: it would lose it if it were detached."""
+    return x.requires_grad and not torch.is_grad_enabled() and not has_tangent(x)
+
+
 def has_tangent(*values: Tensor | None) -> bool:
     """Whether one of them carries a tangent."""
     return in_forward_mode() and any(x is not None and tangent(x) is not None for x in values)
