@@ -74,8 +74,9 @@ def mechanics(draw: Contacts, capsules: Capsules, dt: float) -> tf.Mechanics:
         given |= {"passes": draw.passes, "max_elongation": draw.elongation}
         least = min([draw.viscosity, *(viscosity for _, viscosity in draw.drags)])
         if draw.sticks:
-            # the greatest of a drawn strength, e⁴ times its median, must be allowed, too
-            strength = draw.sticks * least * 0.2 / dt / (math.exp(4.0) if draw.uneven else 1.0)
+            # the greatest of a drawn strength, e⁴ times its median, must be allowed in the least of
+            # a drawn viscosity
+            strength = draw.sticks * least * 0.2 / dt / (math.exp(8.0) if draw.uneven else 1.0)
             to = ("cells", "walls") if draw.wall else ("cells",)
             given["adhesion"] = [tf.Adhesion(each(draw, strength), 0.2, to=x) for x in to]
     length_drag, viscosity = draw.length_drag, draw.viscosity

@@ -368,6 +368,18 @@ def test_the_limit_of_strength_holds_in_steps():
     assert model.step(model.start(), 0.0).step == 1
 
 
+def test_the_limit_of_strength_follows_a_drawn_viscosity():
+    """It is that of the least that may be drawn, here e^(−0.4) · 1000."""
+    most = 2.5e4 * 0.1 / 0.02 * 1000.0 * math.exp(-0.4)
+    for share, allowed in ((0.9, True), (1.1, False)):
+        scene = stuck(pair(0.05), tf.Adhesion(share * most), viscosity=tf.LogNormal(1e3, 0.1))
+        if allowed:
+            assert not tf.failures(list(tf.simulate(scene, until=0.02))[-1])
+            continue
+        with pytest.raises(InputError, match=r"Adhesion\.strength"):
+            list(tf.simulate(scene, until=0.02))
+
+
 @BACKENDS
 def test_what_two_cells_or_a_cell_and_a_wall_share_counts_for_the_limit(backend):
     """Kinds add up where they hold the same cell; of a partner what some cell has; 0.9 times the

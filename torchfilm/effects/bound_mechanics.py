@@ -117,8 +117,8 @@ class BoundMechanics(BoundEffect):
 
     def _strongest(self, dt: float) -> list[float]:
         """The strengths of the kinds of adhesion beyond which solves would not converge."""
-        viscosity = self.effect.viscosity
-        least = 1.0 if is_drawn(viscosity) else float(numbers(viscosity).min())
+        least = float(numbers(self.effect.viscosity).min())
+        least = least if least > 0 else 1.0  # a distribution that goes down to 0
         most = STIFFEST * least / dt if dt > 0 else math.inf
         return [most * min(kind.reach, USUAL) for kind in self.effect.adhesion]
 
