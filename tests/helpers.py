@@ -70,6 +70,15 @@ def run(
     return state
 
 
+def check_same_bits_alone(scene: tf.Scene, until: float, seed: int) -> None:
+    """Each of three colonies has the same cells at the same places alone as in a batch."""
+    together = [s for s in tf.simulate(scene, until=until, colonies=3, seed=seed)][-1]
+    for k in range(3):
+        alone = [s for s in tf.simulate(scene, until=until, streams=[k], seed=seed)][-1]
+        part = together.select([k])
+        assert bool((part.position == alone.position).all()) and part.cells == alone.cells
+
+
 def check_always(state: tf.State, scene: tf.Scene | None = None) -> None:
     """What the hard cases ask of every state: finite, |axis| = 1 ± 1e-6, length ≥ 0, every colony's
     solve converged."""

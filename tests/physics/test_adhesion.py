@@ -7,7 +7,18 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import array, check_always, crowd, growth, mechanics, pair_gaps, run, seeded, step
+from helpers import (
+    array,
+    check_always,
+    check_same_bits_alone,
+    crowd,
+    growth,
+    mechanics,
+    pair_gaps,
+    run,
+    seeded,
+    step,
+)
 
 import torchfilm as tf
 from torchfilm.tools.checks import InputError, SimulationError
@@ -225,11 +236,7 @@ def test_same_bits_alone_and_in_a_batch(backend):
         founders=crowd(np.random.default_rng(8), 12, 2),
         dt=0.02,
     )
-    together = [s for s in tf.simulate(scene, until=0.4, colonies=3, seed=4)][-1]
-    for k in range(3):
-        alone = [s for s in tf.simulate(scene, until=0.4, streams=[k], seed=4)][-1]
-        part = together.select([k])
-        assert bool((part.position == alone.position).all()) and part.cells == alone.cells
+    check_same_bits_alone(scene, until=0.4, seed=4)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

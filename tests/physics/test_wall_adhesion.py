@@ -5,7 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from helpers import array, check_always, crowd, growth, mechanics, run, seeded, step
+from helpers import (
+    array,
+    check_always,
+    check_same_bits_alone,
+    crowd,
+    growth,
+    mechanics,
+    run,
+    seeded,
+    step,
+)
 
 import torchfilm as tf
 from torchfilm.tools.checks import InputError
@@ -185,11 +195,7 @@ def test_same_bits_alone_and_in_a_batch(backend):
         tf.Division(length=3.0),
         founders=crowd(np.random.default_rng(8), 12, 2), dt=0.02,
     )  # fmt: skip
-    together = [s for s in tf.simulate(scene, until=0.4, colonies=3, seed=4)][-1]
-    for k in range(3):
-        alone = [s for s in tf.simulate(scene, until=0.4, streams=[k], seed=4)][-1]
-        part = together.select([k])
-        assert bool((part.position == alone.position).all()) and part.cells == alone.cells
+    check_same_bits_alone(scene, until=0.4, seed=4)
 
 
 @pytest.mark.parametrize("strength", [100.0, 5e4])
