@@ -108,15 +108,15 @@ def signalling() -> tf.Scene:
 
 
 # The bounds, reads a step, and what they are made of. A pass of one-sided contacts, of which most
-# steps have one, reads 17 times around two searches, and 24 times in ten rounds of Newton's method:
-# once a round, and once in eight iterations of conjugate gradients. Bilateral ones read 10 times
-# around a search, and 8 to 10 times in two rounds. A step of a circuit's solver reads twice: 45 in
-# 23 steps, and again in each of three or four iterations with transport. One read more in each
-# iteration, or in each step of a solver, would pass these bounds.
+# steps have one, reads 17 times around two searches, and 50 times in ten rounds of Newton's method:
+# once a round, and once in two iterations of conjugate gradients (`tools.reads` tells why).
+# Bilateral ones read 10 times around a search, and 8 to 12 times in two rounds. A step of a
+# circuit's solver reads twice: 45 in 23 steps, and again in each of three or four iterations with
+# transport. One read more in each iteration, or in each step of a solver, would pass these bounds.
 SCENES = {
-    "free growth": (lambda: tf.Scene(*colony("one-sided"), dt=0.025), 45),
-    "bilateral contacts": (lambda: tf.Scene(*colony("bilateral"), dt=0.025), 21),
-    "a circuit with a signal": (signalling, 221),
+    "free growth": (lambda: tf.Scene(*colony("one-sided"), dt=0.025), 69),
+    "bilateral contacts": (lambda: tf.Scene(*colony("bilateral"), dt=0.025), 22),
+    "a circuit with a signal": (signalling, 239),
 }
 
 

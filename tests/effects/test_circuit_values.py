@@ -7,6 +7,7 @@ import math
 
 import pytest
 import torch
+from mock_cuda import pretended_cuda  # noqa: F401
 from reacting import F64, advance, idle, made, resting
 
 import torchfilm as tf
@@ -63,6 +64,10 @@ def test_each_type_runs_its_own_circuit_and_others_are_only_diluted(dtype, devic
     assert float(last.m[2]) == pytest.approx(thin * math.exp(-0.5), rel=exact)
     assert float(last.m[3]) == pytest.approx(thin * math.exp(-2.0), rel=exact)
     assert float(last.m[3] + last.w[3]) == pytest.approx(thin, rel=exact)
+
+
+def test_slopes_that_are_numbers_are_on_the_device(pretended_cuda):  # noqa: F811
+    test_each_type_runs_its_own_circuit_and_others_are_only_diluted(torch.float64, "cuda")
 
 
 @pytest.mark.filterwarnings("ignore:Circuit has rates for cells of type:UserWarning")  # by hand

@@ -7,9 +7,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mock_cuda import pretended_cuda  # noqa: F401
 
 import torchfilm as tf
-from torchfilm.signals import exchange
+from torchfilm.signals import compiled, exchange
 from torchfilm.signals.exchange import Stencil, pool_volume, read, stencil, write
 from torchfilm.signals.grid import Grid
 from torchfilm.tools.checks import InputError
@@ -426,3 +427,25 @@ def test_the_error_of_taking_turns_is_that_of_a_run(diffusion, splitting):
 
 def test_without_diffusion_and_decay_nothing_takes_turns():
     assert exchange.turns_error(0.0, 0.0, grid([(5, 4, 1)]), 0.1) == 0.0
+
+
+def test_sums_of_a_gpu_do_not_see_the_others(pretended_cuda, dtype):  # noqa: F811
+    """They are trees: entries of weight 0, of grids of more axes, must not change their order."""
+    for masked in (False, True):
+        test_a_colony_does_not_see_the_others("cuda", dtype, masked, None)
+
+
+@pytest.mark.parametrize("by_torch", [False, True])
+def test_uptake_of_almost_nothing_leaves_nothing_negative(by_torch, device, dtype, monkeypatch):
+    """Below the least normal number rounding is no part of the content."""
+    if by_torch:
+        monkeypatch.setattr(compiled, "may_run", lambda *_: False)
+    g, kind = grid([(5, 4, 3)], device), torch.finfo(dtype)
+    for steps in (16, 4000):
+        position, colony = scattered(g, 2000, seed=3)
+        found = stencil(g, position, colony, dtype=dtype)
+        values = random_values(g, dtype) * (steps * kind.tiny * kind.eps)
+        for _ in range(3):
+            before = values
+            values = write(values, -read(values, found) * pool_volume(found), found)
+            assert float(values.min()) >= 0.0 and float(values.sum()) <= float(before.sum())

@@ -45,7 +45,7 @@ class CompiledStiff(Compiled):
         """∂fᵢ/∂uₖ (V, V, M) at u (V, M) of the cells `rows` (M,) among all."""
         values = self.values(circuit, rows, pools(circuit, rows))
         values |= dict(zip(self.equations.variables, u, strict=True))
-        found = evaluated(list(self.slopes.values()), lambda leaf: values[leaf.name])
+        found = evaluated(list(self.slopes.values()), lambda leaf: values[leaf.name], u.device)
         zero = torch.zeros_like(u[0])
         at = dict(zip(self.slopes, found, strict=True))
         count = u.shape[0]

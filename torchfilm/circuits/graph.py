@@ -25,7 +25,7 @@ from torchfilm.circuits.formulas import latex, text
 from torchfilm.circuits.names import Names, UnknownName, has_no, unknown
 from torchfilm.circuits.network import Network, build_network
 from torchfilm.circuits.reactions import OUTSIDE
-from torchfilm.circuits.tracing import LAWS, Column, common_type
+from torchfilm.circuits.tracing import FULL, LAWS, Column, common_type
 from torchfilm.tools import checks
 from torchfilm.tools.deterministic_math import deterministic_functions
 
@@ -262,7 +262,9 @@ class CircuitGraph:
         return rates[np.isfinite(rates).all(1)]
 
 
-def evaluated(roots: Sequence[Expression], leaf: Callable[[Expression], Tensor]) -> list[Tensor]:
+def evaluated(
+    roots: Sequence[Expression], leaf: Callable[[Expression], Tensor], device: Any = "cpu"
+) -> list[Tensor]:
     """Expressions as tensors, each part once, by the functions with which circuits run."""
     made: dict[Expression, Any] = {}
     with deterministic_functions():
@@ -272,7 +274,8 @@ def evaluated(roots: Sequence[Expression], leaf: Callable[[Expression], Tensor])
             elif node.op == NAME:
                 made[node] = leaf(node)
             else:
-                made[node] = OPERATIONS[node.op](*_given(node.op, [made[a] for a in node.args]))
+                found = OPERATIONS[node.op](*_given(node.op, [made[a] for a in node.args]))
+                made[node] = found.to(device) if node.op in FULL else found
     return [
         torch.as_tensor(made[r], dtype=None if isinstance(made[r], Tensor) else F64) for r in roots
     ]

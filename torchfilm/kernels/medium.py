@@ -115,8 +115,15 @@ def pools(node, weight, volume, sums, out):
             sums[index(node[i, c]), 0] = 0
 
 
+@kernel(inline=True)
+def _emptied(content, share, slack, least):
+    """Whether only rounding makes a share of a voxel's content more than the whole."""
+    size = abs(content)
+    return share > 1 and share * size - size < slack * size + least
+
+
 @kernel(entry=True)
-def write(out, amount, there, node, weight, volume, near_one, sums, seen):
+def write(out, amount, there, node, weight, volume, slack, least, sums, seen):
     """Values after secretion and uptake, in place; there: what each cell reads. sums: (nodes, 2) of
     0, and so again in the end, for the part taken and what is given. seen: (N K,), for the voxels
     where cells are: nothing is done elsewhere."""
@@ -137,14 +144,16 @@ def write(out, amount, there, node, weight, volume, near_one, sums, seen):
         share, more = sums[k, 0], sums[k, 1]
         if share == 0 and more == 0:
             continue  # nothing is done, or it is done already
-        if share > 1 and share < near_one:
+        if _emptied(out[k], share, slack, least):
             share = one
         out[k] = out[k] - out[k] * share + more
         sums[k, 0], sums[k, 1] = zero, zero
 
 
 @kernel(entry=True)
-def write_moved(values, out, amount, turned, there, shift, node, weight, volume, near_one, sums):
+def write_moved(
+    values, out, amount, turned, there, shift, node, weight, volume, slack, least, sums
+):
     """The tangent of `write`, in place; of amount and there it is turned and shift. sums: (nodes,
     3) of 0, and so again in the end, for the parts taken, their tangents and those of what is
     given."""
@@ -173,7 +182,7 @@ def write_moved(values, out, amount, turned, there, shift, node, weight, volume,
             share, less, more = sums[k, 0], sums[k, 1], sums[k, 2]
             if share == 0 and less == 0 and more == 0:
                 continue
-            if share > 1 and share < near_one:
+            if _emptied(values[k], share, slack, least):
                 share, less = one, one - one
             out[k] = out[k] * (one - share) - values[k] * less + more
             sums[k, 0], sums[k, 1], sums[k, 2] = 0, 0, 0

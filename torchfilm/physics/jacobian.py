@@ -91,11 +91,15 @@ class ContactJacobian:
 
     def apply(self, x: Tensor) -> Tensor:
         """J x: (N, D) -> (R,)."""
-        if x.device.type != "cpu" or self._needs_grad(x) or not self.rows:
+        if self._needs_grad(x) or not self.rows:
             pair = (self.row_first * x.index_select(0, self.first)).sum(1) + (
                 self.row_second * x.index_select(0, self.second)
             ).sum(1)
             return torch.cat([pair, (self.row_wall * x.index_select(0, self.at_wall)).sum(1)])
+        if x.device.type != "cpu":  # in few operations: there each costs more than its arithmetic
+            each = (self._entries * x.index_select(0, self.half_rows.owner)).sum(1)
+            pairs, others, walls = each.split([self.pairs, self.pairs, self.walls])
+            return torch.cat([pairs + others, walls]) if self.walls else pairs + others
         if self._matrix is None:
             self._matrix = self._assemble(x.shape[1])
         return torch.mm(self._matrix, x.reshape(-1, 1)).squeeze(1)
@@ -111,11 +115,14 @@ class ContactJacobian:
         return halves.sum(e.index_select(0, row))
 
     @cached_property
+    def _entries(self) -> Tensor:
+        """The row entries of all halves, (2 K + W, D)."""
+        return torch.cat([self.row_first, self.row_second, self.row_wall]).detach()
+
+    @cached_property
     def _halves(self) -> tuple[WeightedRows, Tensor]:
         """The row entries of each cell, sorted by cell, and the row of each entry."""
-        halves = WeightedRows(
-            torch.cat([self.row_first, self.row_second, self.row_wall]).detach(), self.half_rows
-        )
+        halves = WeightedRows(self._entries, self.half_rows)
         pair = torch.arange(self.pairs, device=self.first.device)
         wall = torch.arange(self.pairs, self.rows, device=self.first.device)
         return halves, halves.sorted(torch.cat([pair, pair, wall]))
@@ -136,7 +143,7 @@ class ContactJacobian:
         parts = torch.cat(
             [self.row_first.abs() * pair, self.row_second.abs() * pair, self.row_wall.abs() * wall]
         )
-        return self.half_rows.sum_into(parts, parts.new_empty(self.cells, parts.shape[1]))
+        return self.half_rows.plain_sum(parts)
 
     def blocks(self, active: Tensor | None = None) -> Tensor:
         """The diagonal blocks of Jᵀ diag(active) J, or of JᵀJ: (R,) -> (N, D, D)."""

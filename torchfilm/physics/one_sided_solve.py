@@ -224,6 +224,7 @@ class _LineSearch:
         share = -self.start / torch.where(self.looking, curvature, 1.0)
         self.share = torch.minimum(torch.where(self.looking, share, 0.0), self.most)
         self.low, self.high, self.looks = zero, torch.full_like(zero, torch.inf), 0
+        self.one = zero.new_ones(())  # a GPU would copy a plain number each time
 
     def _slope(self, share: Tensor) -> tuple[Tensor, Tensor]:
         """The slope and the curvature of the energy at a share of the step, (B,)."""
@@ -241,7 +242,7 @@ class _LineSearch:
             looking = self.looking & ~flat & ~((here < 0) & (self.share == self.most))
             self.low = torch.where(looking & (here < 0), self.share, self.low)
             self.high = torch.where(looking & (here >= 0), self.share, self.high)
-            new = self.share - here / torch.where(curvature > 0, curvature, 1.0)
+            new = self.share - here / torch.where(curvature > 0, curvature, self.one)
             between = torch.where(
                 self.high < torch.inf, 0.5 * (self.low + self.high), 2.0 * self.share
             )

@@ -249,11 +249,12 @@ def _of_stencil(stencil: Stencil, dtype: torch.dtype) -> tuple[np.ndarray, np.nd
 
 
 @lru_cache(16)
-def _limits(voxel_volume: float, dtype: torch.dtype, ulps: int) -> tuple[Any, Any]:
-    """The volume of a voxel, and the share up to which a voxel counts as emptied, as kernels take
-    them."""
-    number = in_numpy(dtype)
-    return number(voxel_volume), number(1 + ulps * torch.finfo(dtype).eps)
+def _limits(voxel_volume: float, dtype: torch.dtype, ulps: int) -> tuple[Any, Any, Any]:
+    """The volume of a voxel, and by how much more than its content rounding alone may take: a part
+    of it, and the least; as kernels take them."""
+    number, kind = in_numpy(dtype), torch.finfo(dtype)
+    slack = ulps * kind.eps
+    return number(voxel_volume), number(slack), number(slack * kind.tiny)
 
 
 def spans(position: Tensor, groups: Groups) -> tuple[Tensor, Tensor]:

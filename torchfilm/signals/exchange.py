@@ -25,7 +25,8 @@ from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 
 # Where several cells empty a voxel together, their parts add up to 1 except for rounding. A sum
-# within this many units in the last place counts as 1.
+# within this many units in the last place of the content counts as 1; below the least normal
+# number, in the last place of that one.
 ULPS = 64
 
 
@@ -272,9 +273,10 @@ def write(values: Tensor, amount: Tensor, stencil: Stencil, there: Tensor | None
     part = wanted / (torch.where(there > 0, there, 1.0) * volume)
     part = torch.where((wanted > 0) & (there <= 0), torch.inf, part)
     taken = stencil.sum(weight * part.unsqueeze(1))
-    taken = torch.where(
-        (taken > 1) & (taken < 1 + ULPS * torch.finfo(values.dtype).eps), 1.0, taken
-    )
+    content, kind = values.abs(), torch.finfo(values.dtype)
+    slack = ULPS * kind.eps
+    rounding = slack * content + slack * kind.tiny
+    taken = torch.where((taken > 1) & (taken * content - content < rounding), 1.0, taken)
     given = stencil.sum(weight * (added / volume).unsqueeze(1))
     return torch.addcmul(values, values, taken, value=-1.0) + given
 

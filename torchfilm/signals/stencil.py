@@ -50,7 +50,9 @@ class Stencil:
     @cached_property
     def groups(self) -> Groups:
         """The voxel of each entry of `node`, row by row."""
-        return Groups(self.node.reshape(-1), self.nodes)
+        # grids of more axes have more entries, of weight 0: sums must not depend on them
+        zero = None if self.node.device.type == "cpu" else self.weight.detach().reshape(-1) == 0
+        return Groups(self.node.reshape(-1), self.nodes, zero=zero)
 
     def gather(self, values: Tensor) -> Tensor:
         """Values (nodes,) at the stencil's voxels, (N, K)."""

@@ -82,21 +82,20 @@ def conjugate_gradients(
     going = going & (torch.as_tensor(max_iterations, device=b.device) > 0)
     iterations = torch.zeros(groups.size, dtype=torch.int64, device=b.device)
     free = reads_are_free(b.device)
+    zero, one = rz.new_zeros(()), rz.new_ones(())  # a GPU would copy a plain number each time
     for k in itertools.count(1):
         q = apply(p)
         curvature = _dot(p, q, groups)
         moves = going.unsqueeze(1) & (curvature > 0)
-        step = _for_rows(
-            torch.where(moves, rz / torch.where(moves, curvature, 1.0), 0.0), groups, b.shape[1]
-        )
+        step = torch.where(moves, rz / torch.where(moves, curvature, one), zero)
+        step = _for_rows(step, groups, b.shape[1])
         x.addcmul_(step, p)
         r.addcmul_(step, q, value=-1)
         z = precondition(r)
         new = _dot(r, z, groups)
         iterations += going
-        ratio = _for_rows(
-            torch.where(moves, new / torch.where(rz == 0, 1.0, rz), 0.0), groups, b.shape[1]
-        )
+        ratio = torch.where(moves, new / torch.where(rz == 0, one, rz), zero)
+        ratio = _for_rows(ratio, groups, b.shape[1])
         p = torch.addcmul(z, ratio, p)
         rz = new
         worst = torch.where(going, measure(), worst)

@@ -82,16 +82,17 @@ class Groups:
     Rows 0 … K − 1 belong to groups 0 … size − 1.
 
     `owner`: (K,) int64, the group of each row. `ordered`: rows are known to be sorted by group;
-    else they may have any order.
+    else they may have any order. zero: (K,) bool, rows known to be 0. A GPU adds them up after the
+    others of their group, so that a sum does not depend on their number.
     """
 
-    def __init__(self, owner: Tensor, size: int, ordered: bool = False):
-        self.owner, self.size, self.ordered = owner, size, ordered
+    def __init__(self, owner: Tensor, size: int, ordered: bool = False, zero: Tensor | None = None):
+        self.owner, self.size, self.ordered, self.zero = owner, size, ordered, zero
         self._matrix: dict[torch.dtype, Tensor] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         # without what it has worked out: torch does not copy sparse matrices
-        return (Groups, (self.owner, self.size, self.ordered))
+        return (Groups, (self.owner, self.size, self.ordered, self.zero))
 
     @cached_property
     def counts(self) -> Tensor:
@@ -128,8 +129,11 @@ class Groups:
             rows = torch.arange(owner.numel(), dtype=torch.int32, device=owner.device)
         elif on_cpu:
             return self._order_in_linear_time()
-        else:
+        elif self.zero is None:
             owner, rows = torch.sort(owner, stable=True)
+        else:
+            both, rows = torch.sort(2 * owner + self.zero, stable=True)
+            owner = both // 2
         group = torch.arange(self.size + 1, device=owner.device)
         return torch.searchsorted(owner, group, out_int32=True), rows.int()
 
@@ -161,16 +165,16 @@ class Groups:
         flat = value.reshape(value.shape[0], math.prod(value.shape[1:]))
         return _GroupSum.apply(flat, self).reshape(self.size, *value.shape[1:])
 
-    def sum_into(self, value: Tensor, out: Tensor) -> Tensor:
-        """Like `sum` for (K, D) into (size, D), without gradient or allocation on the CPU."""
+    def plain_sum(self, value: Tensor) -> Tensor:
+        """Like `sum` for (K, D) into (size, D), without gradient."""
         if self.owner.numel() == 0:
-            return out.zero_()
+            return value.new_zeros(self.size, value.shape[1])
         if value.device.type == "cpu":
-            return torch.mm(self._incidence(value.dtype), value, out=out)
+            return torch.mm(self._incidence(value.dtype), value)
         value = self._sorted(value)
         for start in self._tree:
             value = torch.segment_reduce(value, "sum", offsets=start, unsafe=True)
-        return out.copy_(value)
+        return value
 
     def spread(self, value: Tensor) -> Tensor:
         """The value of its group for each row, (size, …) -> (K, …); its gradient is a `sum`."""
@@ -298,7 +302,7 @@ class _GroupSum(torch.autograd.Function):
     @staticmethod
     def forward(ctx, value: Tensor, groups: Groups) -> Tensor:
         ctx.groups = groups
-        return groups.sum_into(value, value.new_empty(groups.size, value.shape[1]))
+        return groups.plain_sum(value)
 
     @staticmethod
     def backward(ctx, grad: Tensor):
@@ -306,4 +310,4 @@ class _GroupSum(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx, tangent: Tensor, _):
-        return ctx.groups.sum_into(tangent, tangent.new_empty(ctx.groups.size, tangent.shape[1]))
+        return ctx.groups.plain_sum(tangent)

@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 # Iterations of many systems at once between two reads whether all are done. A read never changes a
-# result, because a finished system does not move.
-READ_EVERY = 8
+# result, because a finished system does not move. On an H200 (2026-11-27) an operation took the
+# host 11 µs, and an iteration of conjugate gradients has 60, far more than a read: with 8 in place
+# of 2 a step of 1,000 cells took 1.13 to 1.2 times as long.
+READ_EVERY = 2
 
 
 def reads_are_free(device: torch.device) -> bool:
