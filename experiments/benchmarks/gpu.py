@@ -1,0 +1,98 @@
+"""Measures steps of the same states by compiled kernels on the CPU and by torch on a GPU.
+
+    python experiments/benchmarks/gpu.py                        # all cases, some minutes
+    python experiments/benchmarks/gpu.py --case "64 x 100"
+    python experiments/benchmarks/gpu.py --device cpu --case "1 x 1000"   # torch on the CPU instead
+
+Colonies grow on the CPU to the given number of cells each. Then both take the same steps from
+there, and the table gives the least time of a step. Contacts are those of free growth, one-sided,
+2-D, float32; the other cases are ready-made scenes. The script appends each case to a JSON file
+with its machine, versions and commit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from record import machine
+
+import torchfilm as tf
+
+STEPS = 6
+# by name: the ready-made scene, None for free growth; colonies; cells of each
+CASES = {
+    "1 x 1000": (None, 1, 1000), "64 x 100": (None, 64, 100), "64 x 1000": (None, 64, 1000),
+    "512 x 1000": (None, 512, 1000), "repressilator 64 x 100": ("repressilator", 64, 100),
+    "quorum sensing 16 x 100": ("quorum_sensing", 16, 100),
+}  # fmt: skip
+
+
+def scene_of(name: str | None, backend: str | None) -> tf.Scene:
+    """Returns a scene whose contacts are computed by a backend."""
+    if name is not None:
+        scene = tf.scenes.build(name)
+        by = lambda e: replace(e, backend=backend) if isinstance(e, tf.Mechanics) else e
+        return scene.replace(*(by(e) for e in scene.effects))
+    return tf.Scene(
+        tf.Growth(rate=1.0, law="length"), tf.Division(length=tf.Uniform(3.5, 4.0)),
+        tf.Mechanics(dim=2, backend=backend), dim=2, dt=0.025,
+    )  # fmt: skip
+
+
+def timed(model: tf.Model, state: tf.State) -> tuple[float, int]:
+    """Returns the least time of a step, ms, and the CG iterations of all steps."""
+    times, iterations = [], 0
+    wait = torch.cuda.synchronize if state.device.type == "cuda" else lambda: None
+    for _ in range(STEPS):
+        wait()
+        begin = time.perf_counter()
+        state = model.step(state)
+        wait()
+        times.append(1e3 * (time.perf_counter() - begin))
+        iterations += int(state.reports["mechanics"].iterations.max())
+    return min(times), iterations
+
+
+def measure(case: str, device: str) -> dict:
+    """Runs one case. Returns its record."""
+    name, colonies, cells = CASES[case]
+    scene = scene_of(name, None)
+    *_, state = tf.simulate(scene, colonies=colonies, cells=cells, seed=1)
+    kernels, _ = timed(scene.bind(colonies, seed=1), state)
+    there = scene_of(name, "torch" if device == "cpu" else None)
+    by_torch, iterations = timed(there.bind(colonies, seed=1, device=device), state.to(device))
+    return {
+        "case": case, "cells": state.cells, "device": device,
+        "kernels_ms": round(kernels, 1), "torch_ms": round(by_torch, 1),
+        "iterations_per_step": round(iterations / STEPS, 1),
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--case", nargs="*", choices=list(CASES), default=list(CASES))
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
+    options = parser.parse_args()
+    torch.set_grad_enabled(False)
+    records = json.loads(options.out.read_text()) if options.out.exists() else []
+    print(f"{'case':26} {'cells':>8} {'kernels, CPU':>14} {'torch, ' + options.device:>14}")
+    for case in options.case:
+        found = measure(case, options.device)
+        print(
+            f"{case:26} {found['cells']:8} {found['kernels_ms']:11.1f} ms"
+            f" {found['torch_ms']:11.1f} ms"
+        )
+        records.append(machine() | found)
+        options.out.write_text(json.dumps(records, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
