@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_devices import SMALL, STEPS
+from test_devices import SMALL, STEPS, check_as_on_the_cpu
 
 import torchfilm as tf
 
@@ -15,9 +15,10 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a G
 @pytest.fixture(autouse=True)
 def deterministic(monkeypatch):
     monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    before = torch.are_deterministic_algorithms_enabled()
     torch.use_deterministic_algorithms(True)
     yield
-    torch.use_deterministic_algorithms(False)
+    torch.use_deterministic_algorithms(before)
 
 
 def every(state: tf.State) -> dict[str, torch.Tensor]:
@@ -39,6 +40,12 @@ def grown(scene: tf.Scene, steps: int, colonies: int) -> tf.State:
 def after(scene: tf.Scene, state: tf.State, steps: int) -> tf.State:
     *_, state = tf.simulate(scene, state, until=state.time + steps * scene.dt)
     return state
+
+
+@pytest.mark.parametrize("name", STEPS)
+@torch.no_grad()
+def test_a_scene_comes_to_what_it_does_on_the_cpu(name):
+    check_as_on_the_cpu(name)
 
 
 @pytest.mark.parametrize("name", STEPS)

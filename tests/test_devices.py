@@ -45,6 +45,11 @@ def grown(name: str, device: str) -> tf.State:
 @pytest.mark.parametrize("name", STEPS)
 @torch.no_grad()
 def test_a_scene_runs_where_it_was_asked_to(pretended_cuda, name):  # noqa: F811
+    check_as_on_the_cpu(name)
+
+
+def check_as_on_the_cpu(name: str) -> None:
+    """All of a ready scene is on CUDA, and what it is on the CPU."""
     there, here = grown(name, "cuda"), grown(name, "cpu")
     assert there.position.device.type == "cuda" and here.position.device.type == "cpu"
     every = [

@@ -2,7 +2,7 @@
 
     python experiments/benchmarks/gpu.py                        # all cases, some minutes
     python experiments/benchmarks/gpu.py --case "64 x 100"
-    python experiments/benchmarks/gpu.py --device cpu --case "1 x 1000"   # torch on the CPU instead
+    python experiments/benchmarks/gpu.py --device cpu --case "1 x 1000"   # by torch, contacts only
 
 Colonies grow on the CPU to the given number of cells each. Then both take the same steps from
 there, and the table gives the least time of a step. Contacts are those of free growth, one-sided,

@@ -8,6 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mock_cuda import pretended_cuda  # noqa: F401
+from torch.autograd import forward_ad
 
 import torchfilm as tf
 from torchfilm.signals import compiled, exchange
@@ -15,6 +16,7 @@ from torchfilm.signals.exchange import Stencil, pool_volume, read, stencil, writ
 from torchfilm.signals.grid import Grid
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.ragged import Groups
+from torchfilm.tools.tangents import forward_mode, tangent
 from torchfilm.tools.threads import Shared
 
 SPACING = (2.0, 1.0, 0.5)
@@ -449,3 +451,25 @@ def test_uptake_of_almost_nothing_leaves_nothing_negative(by_torch, device, dtyp
             before = values
             values = write(values, -read(values, found) * pool_volume(found), found)
             assert float(values.min()) >= 0.0 and float(values.sum()) <= float(before.sum())
+
+
+def test_tangents_where_a_voxel_is_emptied(dtype, monkeypatch):
+    """By kernels as by torch: a share that only rounding makes more than 1 has no tangent."""
+    g = grid([(3, 2, 2)])
+    position, colony = scattered(g, 200, seed=5)
+    found = stencil(g, position, colony, dtype=dtype)
+    values = random_values(g, dtype)
+    there, pool = read(values, found), pool_volume(found)
+    pool = pool * (1 + 20 * torch.finfo(dtype).eps)
+    share = found.sum(found.weight * (pool / found.voxel_volume).unsqueeze(1))
+    assert bool((share > 1).any())
+
+    def moved():
+        with forward_mode():
+            dual = forward_ad.make_dual(-there * pool, torch.ones_like(pool))
+            return tangent(write(values, dual, found, there))
+
+    by_kernels = moved()
+    for name in ("may_run", "may_run_forward"):
+        monkeypatch.setattr(compiled, name, lambda *_: False)
+    assert torch.allclose(by_kernels, moved(), rtol=1e-4, atol=1e-5)

@@ -116,10 +116,10 @@ def pools(node, weight, volume, sums, out):
 
 
 @kernel(inline=True)
-def _emptied(content, share, slack, least):
+def _emptied(content, share, one, slack, least):
     """Whether only rounding makes a share of a voxel's content more than the whole."""
     size = abs(content)
-    return share > 1 and share * size - size < slack * size + least
+    return share > one and (share - one) * size < slack * size + least
 
 
 @kernel(entry=True)
@@ -144,7 +144,7 @@ def write(out, amount, there, node, weight, volume, slack, least, sums, seen):
         share, more = sums[k, 0], sums[k, 1]
         if share == 0 and more == 0:
             continue  # nothing is done, or it is done already
-        if _emptied(out[k], share, slack, least):
+        if _emptied(out[k], share, one, slack, least):
             share = one
         out[k] = out[k] - out[k] * share + more
         sums[k, 0], sums[k, 1] = zero, zero
@@ -182,7 +182,7 @@ def write_moved(
             share, less, more = sums[k, 0], sums[k, 1], sums[k, 2]
             if share == 0 and less == 0 and more == 0:
                 continue
-            if _emptied(values[k], share, slack, least):
+            if _emptied(values[k], share, one, slack, least):
                 share, less = one, one - one
             out[k] = out[k] * (one - share) - values[k] * less + more
             sums[k, 0], sums[k, 1], sums[k, 2] = 0, 0, 0

@@ -276,7 +276,7 @@ def write(values: Tensor, amount: Tensor, stencil: Stencil, there: Tensor | None
     content, kind = values.abs(), torch.finfo(values.dtype)
     slack = ULPS * kind.eps
     rounding = slack * content + slack * kind.tiny
-    taken = torch.where((taken > 1) & (taken * content - content < rounding), 1.0, taken)
+    taken = torch.where((taken > 1) & ((taken - 1) * content < rounding), 1.0, taken)
     given = stencil.sum(weight * (added / volume).unsqueeze(1))
     return torch.addcmul(values, values, taken, value=-1.0) + given
 
