@@ -1,11 +1,11 @@
 """A GPU, where there is one: the same bits again, alone, in a batch, after a restart and after a
-file; moves of states between devices; gradients; a search."""
+file; moves of states between devices; gradients."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from test_devices import SMALL, STEPS, check_as_on_the_cpu
+from test_devices import SMALL, STEPS, check_as_on_the_cpu, columns
 
 import torchfilm as tf
 
@@ -21,14 +21,9 @@ def deterministic(monkeypatch):
     torch.use_deterministic_algorithms(before)
 
 
-def every(state: tf.State) -> dict[str, torch.Tensor]:
-    found = {n: getattr(state, n) for n in ("position", "axis", "length", "uid", "parent")}
-    return found | dict(state.fields) | {f"signal {n}": x for n, x in state.signals.items()}
-
-
 def check_same_bits(one: tf.State, other: tf.State) -> None:
     assert one.cells == other.cells
-    for (name, x), y in zip(every(one).items(), every(other).values(), strict=True):
+    for (name, x), y in zip(columns(one).items(), columns(other).values(), strict=True):
         assert x.device == y.device and torch.equal(x, y), name
 
 

@@ -48,18 +48,20 @@ def test_a_scene_runs_where_it_was_asked_to(pretended_cuda, name):  # noqa: F811
     check_as_on_the_cpu(name)
 
 
+def columns(state: tf.State) -> dict[str, torch.Tensor]:
+    """All that a state holds of its cells, and its signals."""
+    names = ("position", "axis", "length", "uid", "parent", "colony")
+    found = {n: getattr(state, n) for n in names} | dict(state.fields)
+    return found | {f"signal {n}": x for n, x in state.signals.items()}
+
+
 def check_as_on_the_cpu(name: str) -> None:
     """All of a ready scene is on CUDA, and what it is on the CPU."""
     there, here = grown(name, "cuda"), grown(name, "cpu")
     assert there.position.device.type == "cuda" and here.position.device.type == "cpu"
-    every = [
-        (n, getattr(there, n), getattr(here, n))
-        for n in ("position", "axis", "length", "uid", "parent", "colony")
-    ]
-    every += [(n, there.fields[n], here.fields[n]) for n in here.fields] + [
-        (n, there.signals[n], here.signals[n]) for n in here.signals
-    ]
-    for n, found, right in every:
+    made = columns(there)
+    for n, right in columns(here).items():
+        found = made[n]
         assert found.device.type == "cuda", n
         assert torch.allclose(found.cpu().double(), right.double(), rtol=1e-6, atol=1e-9), n
 

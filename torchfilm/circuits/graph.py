@@ -265,7 +265,7 @@ class CircuitGraph:
 def evaluated(
     roots: Sequence[Expression], leaf: Callable[[Expression], Tensor], device: Any = "cpu"
 ) -> list[Tensor]:
-    """Expressions as tensors, each part once, by the functions with which circuits run."""
+    """Expressions as tensors on a device, each part once, by the functions of circuits."""
     made: dict[Expression, Any] = {}
     with deterministic_functions():
         for node in walk(roots):
