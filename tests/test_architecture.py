@@ -86,7 +86,7 @@ ONE_EFFECT = [
         "division compiled_division",
         "medium bound_medium medium_transport signal",
         "rules bound_rules bound_division_rule",
-        "mechanics bound_mechanics mechanics_report",
+        "mechanics bound_mechanics mechanics_report mechanics_words",
     )
 ]
 # These take tensors: they never see a state, nor what is built on one.

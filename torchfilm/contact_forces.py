@@ -86,12 +86,12 @@ def pushed_by_cells(
     axis, length, radius = state.axis.double(), state.length.double(), state.radius.double()
     apart = 0.0 if bonds is None else max(bonds.reaches)
     first, second, gap = gaps_nearby(
-        state.position, axis, length, radius, state.colony, state.colonies, apart
+        state.position, axis, length, radius, state.colony, state.colonies, apart, state.space
     )
     near = torch.nonzero(gap < apart).squeeze(1)
     first, second = first.index_select(0, near), second.index_select(0, near)
     start = state.position.index_select(0, state.groups.begin[:-1].index_select(0, state.colony))
-    capsules = Capsules((state.position - start).T, axis.T, 0.5 * length, radius)
+    capsules = Capsules((state.position - start).T, axis.T, 0.5 * length, radius, state.space)
     margin = None if soft_cells else torch.zeros_like(gap.index_select(0, near))
     rows = near_rows(CandidateContacts.all_of(capsules, first, second), margin)
     force = rows.weight * (-rows.gap).clamp(min=0) / soft.index_select(0, rows.first)
@@ -127,7 +127,7 @@ def bonds_of(state: State, scene: Scene) -> Bonds | None:
             ]
             levels = levels_of(effect.adhesion, strengths, state.fields, state.cells)
             cells = state.position.T, state.axis.double().T, 0.5 * state.length.double()
-            begin = Capsules(*cells, state.radius.double())
+            begin = Capsules(*cells, state.radius.double(), state.space)
             holds = holds_of(effect.adhesion, effect.walls, effect.dim)
             return Bonds(levels, tuple(kind.reach for kind in effect.adhesion), begin, holds)
     return None

@@ -33,6 +33,7 @@ from torchfilm.tools.timing import Timings
 from torchfilm.values import CELL, ByType, Rule, checked, is_drawn
 
 if TYPE_CHECKING:
+    from torchfilm.physics.space import PeriodicSpace
     from torchfilm.tools.hot_reload import HotReload
 
 # The stages of a step; an effect says where it belongs. The order is the paper's, but for cells
@@ -103,9 +104,8 @@ class Effect(metaclass=checks.KnownKeywords):
     def __post_init__(self) -> None:
         for name, (given, rule) in self.physical_fields().items():
             if given is not None:
-                object.__setattr__(
-                    self, name, checked(f"{type(self).__name__}.{name}", given, rule)
-                )
+                made = checked(f"{type(self).__name__}.{name}", given, rule)
+                object.__setattr__(self, name, made)
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and hashing.digest(self) == hashing.digest(other)
@@ -118,11 +118,8 @@ class Effect(metaclass=checks.KnownKeywords):
     def physical_fields(self) -> dict[str, tuple[Any, Rule]]:
         """Its own fields that hold physical values, with their rules."""
         fields = dataclasses.fields(self)  # type: ignore[arg-type]
-        return {
-            f.name: (getattr(self, f.name), f.metadata["physical"])
-            for f in fields
-            if "physical" in f.metadata
-        }
+        rules = {f.name: f.metadata["physical"] for f in fields if "physical" in f.metadata}
+        return {name: (getattr(self, name), rule) for name, rule in rules.items()}
 
     def physical_values(self) -> dict[str, tuple[Any, Rule]]:
         """All its physical values by name, with their rules."""
@@ -149,10 +146,8 @@ class Effect(metaclass=checks.KnownKeywords):
         }
 
     def declares(self, dim: int) -> Sequence[Field]:
-        """The fields that this effect adds to the state of a scene in `dim` dimensions.
-
-        A field's `initial` may be a function (state, rows, values).
-        """
+        """The fields that this effect adds to the state of a scene in `dim` dimensions. A field's
+        `initial` may be a function (state, rows, values)."""
         return ()
 
     def reads(self) -> Sequence[str]:
@@ -251,6 +246,11 @@ class Effect(metaclass=checks.KnownKeywords):
     def wall_surfaces(self) -> Sequence[Any]:
         """Surfaces that confine cells."""
         return ()
+
+    @property
+    def space(self) -> PeriodicSpace | None:
+        """Where cells are, if periodic."""
+        return None
 
 
 @dataclass(frozen=True)

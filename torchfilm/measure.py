@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchfilm.contact_forces import bonds_of, pushed_by_cells, pushed_by_walls, softness
 from torchfilm.physics.contacts import gaps_nearby
-from torchfilm.physics.surfaces import FlatSurface, Surface
+from torchfilm.physics.surfaces import FlatSurface
 from torchfilm.physics.walls import Wall, depth_in_walls
 from torchfilm.state import CELL, State
 from torchfilm.tools import checks
@@ -72,7 +72,9 @@ def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
     """
     _check_walls("overlaps", walls)
     axis, length, radius = state.axis.double(), state.length.double(), state.radius.double()
-    i, _, gap = gaps_nearby(state.position, axis, length, radius, state.colony, state.colonies)
+    i, _, gap = gaps_nearby(
+        state.position, axis, length, radius, state.colony, state.colonies, space=state.space
+    )
     depth = -gap
     deep = depth > 0
     pairs = Groups(state.colony.index_select(0, i[deep]), state.colonies)
@@ -81,10 +83,6 @@ def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
     placed = (state.position, axis, length, radius, state.own_colony_id)
     at_walls = depth_in_walls(walls, *placed)
     return Overlap(mean, pairs.max(depth[deep]), count, state.groups.max(at_walls))
-
-
-def _surfaces_of(scene: Scene) -> list[Surface]:
-    return [s for e in scene.effects for s in e.wall_surfaces()]
 
 
 @dataclass(frozen=True)
@@ -112,7 +110,7 @@ def wall_forces(state: State, walls: Sequence[Wall] | Scene, dt: float | None = 
     from torchfilm.scene import Scene  # it imports rooms that measure
 
     if isinstance(walls, Scene):
-        bonds, surfaces = bonds_of(state, walls), _surfaces_of(walls)
+        bonds, surfaces = bonds_of(state, walls), walls.wall_surfaces()
         dt = walls.dt if dt is None else dt
     else:
         _check_walls("wall_forces", walls)
@@ -151,7 +149,7 @@ def pressure(state: State, scene: Scene, dt: float | None = None) -> Tensor:
         raise checks.input_error("pressure(scene)", scene, "the tf.Scene of the state")
     dt = checks.number("pressure(dt)", scene.dt if dt is None else dt, above=0.0)
     soft = softness("pressure", state, dt)
-    surfaces = _surfaces_of(scene)
+    surfaces = scene.wall_surfaces()
     soft_cells = any(e.soft_contacts for e in scene.effects)
     total = torch.zeros_like(soft)
     bonds = bonds_of(state, scene)
@@ -304,7 +302,8 @@ def neighbours(state: State, gap: float) -> tuple[Tensor, Tensor, Tensor]:
     """Pairs of cells of one colony whose surfaces are less than `gap` µm apart, each pair once.
 
     Returns first and second, (P,) int64, and the distance of their centres, (P,) float64 µm. A
-    colony's pairs and their order do not depend on the rest of the batch.
+    colony's pairs and their order do not depend on the rest of the batch. In a periodic space cells
+    at opposite faces are neighbours, too.
     """
     checks.number("neighbours(gap)", gap, least=0.0)
     i, j, apart = gaps_nearby(
@@ -315,11 +314,14 @@ def neighbours(state: State, gap: float) -> tuple[Tensor, Tensor, Tensor]:
         state.colony,
         state.colonies,
         within=gap,
+        space=state.space,
     )
     near = torch.nonzero(apart < gap).squeeze(1)
     i, j = i.index_select(0, near), j.index_select(0, near)
-    between = state.position.index_select(0, j) - state.position.index_select(0, i)
-    return i, j, safe_norm(between.T)
+    between = (state.position.index_select(0, j) - state.position.index_select(0, i)).T
+    if state.space is not None:
+        between = between + state.space.shift(between)
+    return i, j, safe_norm(between)
 
 
 @of_a_state

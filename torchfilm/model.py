@@ -71,6 +71,7 @@ class Model:
                     bound.append(part)
         self.effects: tuple[BoundEffect, ...] = tuple(sorted(bound, key=lambda e: e.stage))
         self._said: set[str] = set()  # what steps have warned of
+        self._space = scene.space
 
     # --- running -------------------------------------------------------------------------
 
@@ -98,7 +99,8 @@ class Model:
         """The state as a step of this model begins, also where another model made it."""
         binding_checks.check_fits(state, self, self._first_fields)
         declared = {**state.declared, **self._first_fields}
-        state = state.replace(births=(), ended=(), reports={}, declared=declared)
+        new = {"declared": declared, "space": self._space}
+        state = state.replace(births=(), ended=(), reports={}, **new)
         for effect in self._openers:
             state = effect.opened(state)
         return state
@@ -126,6 +128,7 @@ class Model:
     def _laid(self) -> State:
         start = self._begin
         state = start.cells.state(start.colonies, start.seed, self.batch.device, self.batch.dtype)
+        state = state.replace(space=self._space)
         if start.streams is not None:
             state = state.replace(stream=start.streams.to(self.batch.device))
         for effect in self.effects:
@@ -176,8 +179,8 @@ class Model:
                 f"{self.batch.dtype} on {self.batch.device}, as the model is",
                 "Bind the scene to the state: scene.bind(state=state).",
             )
-        columns = {name: getattr(state, name) for name in PER_CELL}
         check_declared(state.fields, state.declared)
+        columns = {name: getattr(state, name) for name in PER_CELL}
         check_geometry(columns, state.colonies, state.dim, state.dtype)
         state.check_fields()
         highest = int(state.colony_id.max())
@@ -430,10 +433,7 @@ def _with_given(state: State, wanted: Field) -> State:
     values = state.fields[wanted.name]
     shape = (state.cells, *wanted.shape)
     if wanted.scope != CELL or tuple(values.shape) != shape:
-        raise checks.input_error(
-            f"cells column {wanted.name}",
-            f"values of shape {tuple(values.shape)}",
-            f"left out, or of shape {shape}",
-        )
+        shown, rule = f"values of shape {tuple(values.shape)}", f"left out, or of shape {shape}"
+        raise checks.input_error(f"cells column {wanted.name}", shown, rule)
     declared = state.replace(declared={**state.declared, wanted.name: wanted})
     return declared.with_fields(**{wanted.name: values.to(wanted.dtype or state.dtype)})

@@ -270,7 +270,7 @@ class CellsView(Draws):
         self._read.update(("position", "axis", "length", "radius"))
         s = self._state
         i, j, gap = gaps_nearby(
-            s.position, s.axis, s.length, s.radius, s.colony, s.colonies, within
+            s.position, s.axis, s.length, s.radius, s.colony, s.colonies, within, s.space
         )
         keep = torch.nonzero(gap <= within).squeeze(1)
         return i.index_select(0, keep), j.index_select(0, keep)

@@ -18,6 +18,8 @@ from torchfilm.founders import Draw, one_draw
 from torchfilm.initial_cells import Cells
 from torchfilm.model import Model, bind
 from torchfilm.parameters import given, parameters, summary
+from torchfilm.physics.space import PeriodicSpace
+from torchfilm.physics.surfaces import Surface
 from torchfilm.rule_views import OF_EFFECTS
 from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks, displays
@@ -202,6 +204,15 @@ class Scene(metaclass=checks.KnownKeywords):
         """Each effect with the parameters that differ from their defaults; results files are
         compared by it."""
         return [without_addresses(summary(effect)) for effect in self.effects]
+
+    @property
+    def space(self) -> PeriodicSpace | None:
+        """Where cells are, if that is periodic."""
+        return next((e.space for e in self.effects if e.space is not None), None)
+
+    def wall_surfaces(self) -> list[Surface]:
+        """The surfaces of all walls."""
+        return [surface for effect in self.effects for surface in effect.wall_surfaces()]
 
     @property
     def headline(self) -> str:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.physics import capsule
+from torchfilm.physics.space import PeriodicSpace
 from torchfilm.signals.layout import Contact, Layout, Signals
 from torchfilm.tools import checks, displays, random, row_checks, tangents
 from torchfilm.tools.ragged import Groups, offsets
@@ -52,18 +53,16 @@ class Field(metaclass=checks.KnownKeywords):
         checks.choice(f"Field({self.name!r}).at_division", self.at_division, ("copy", "reset"))
         plain = self.name.removeprefix(OUTSIDE) if self.scope == GRID else self.name
         if not plain.isidentifier() or self.name in RESERVED:
-            raise checks.input_error(
-                "Field.name", self.name, "an identifier that the state does not use itself"
-            )
+            rule = "an identifier that the state does not use itself"
+            raise checks.input_error("Field.name", self.name, rule)
 
     def start(self, state: State, rows: Tensor) -> Tensor:
         """Initial values for the given rows (M,) of the state: (M, *shape)."""
         dtype = self.dtype or state.dtype
         if callable(self.initial):
             return self.initial(state, rows).to(dtype)
-        return torch.full(
-            (rows.numel(), *self.shape), self.initial, dtype=dtype, device=state.device
-        )
+        shape = rows.numel(), *self.shape
+        return torch.full(shape, self.initial, dtype=dtype, device=state.device)
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,8 @@ class State:
     colony go by it. stream (B,): which course of random numbers each follows, by default its
     colony_id; colonies of one stream and alike in their parameters are alike in all. next_uid (B,).
     A field is also an attribute: `state.growth_rate`. layout: where the voxels of signals are, in a
-    scene that has a medium; a signal's values are `state.signals["ahl"]`, (nodes,).
+    scene that has a medium; a signal's values are `state.signals["ahl"]`, (nodes,). space: where
+    cells are, if it is periodic.
     """
 
     colony: Tensor
@@ -127,6 +127,7 @@ class State:
     fields: Mapping[str, Tensor] = field(default_factory=dict)
     declared: Mapping[str, Field] = field(default_factory=dict)
     layout: Layout | None = None
+    space: PeriodicSpace | None = None
     births: tuple[Births, ...] = ()
     ended: tuple[Ended, ...] = ()
     reports: Mapping[str, Any] = field(default_factory=dict)
@@ -290,9 +291,8 @@ class State:
         rows = self._rows[field.scope]
         start = field.start(declared, torch.arange(rows, device=self.device))
         if start.shape[0] != rows:
-            raise checks.input_error(
-                f"initial value of {field.name}", tuple(start.shape), f"of {rows} rows"
-            )
+            what = f"initial value of {field.name}"
+            raise checks.input_error(what, tuple(start.shape), f"of {rows} rows")
         start = start.detach() if tangents.graph_is_dead(start) else start
         return declared.with_fields(**{field.name: start})
 

@@ -133,7 +133,7 @@ def product_over_copy(cells: int = 10000) -> dict[str, float]:
     n = len(x)
     axis, half, radius = np.tile([1.0, 0.0], (n, 1)), np.full(n, 1.5), np.full(n, 0.5)
     scale = np.ones((n, 4))
-    given = no_memory(), x, axis, half, radius
+    given = no_memory(), x, axis, half, radius, np.zeros(3)
     first, second = for_python(neighbours.near_pairs)(*given, 0.3, dof)
     near = for_python(contacts.near_contacts)(*given, first, second, 0.3, dof)
     found = (first, second, *near)
@@ -141,9 +141,7 @@ def product_over_copy(cells: int = 10000) -> dict[str, float]:
     H, gaps = np.empty((2 * room, 4), np.float32), np.empty(room, np.float32)
     one, two = np.empty(room, np.int32), np.empty(room, np.int32)
     places = H, gaps, one, two, np.empty(room, np.uint8)
-    count = for_python(contacts.pair_rows)(
-        no_memory(), x, axis, half, radius, scale, found, 0, places, 0.3, dof
-    )
+    count = for_python(contacts.pair_rows)(*given, scale, found, 0, places, 0.3, dof)
     p, out = np.ones((n, 4), np.float32), np.zeros((n, 4), np.float32)
     on = np.arange(count, dtype=np.int32)
     H = H[: 2 * count].copy()

@@ -153,7 +153,7 @@ from torchfilm.kernels import compiling, memory, neighbours
 x = np.random.default_rng(0).random((50, 2)) * 20
 axis, half, radius = np.tile([1.0, 0.0], (50, 1)), np.ones(50), np.full(50, 0.5)
 near_pairs = compiling.for_python(neighbours.near_pairs)
-first, second = near_pairs(memory.no_memory(), x, axis, half, radius, 0.3, (0,) * 4)
+first, second = near_pairs(memory.no_memory(), x, axis, half, radius, np.zeros(3), 0.3, (0,) * 4)
 print(compiling.FOLDER is not None, first.size)
 """
 

@@ -23,6 +23,7 @@ from torchfilm.tools.ragged import Groups
 
 KERNELS = "torchfilm.kernels."
 DOF = {2: (0,) * 4, 3: (0,) * 8}
+NONE = np.zeros(3)  # no axis is periodic
 
 
 def crowd(rng: np.random.Generator, count: int, dim: int, apart: float = 1.5):
@@ -126,7 +127,7 @@ def test_near_pairs_are_those_whose_boxes_meet(dim, count, apart):
     x, axis, half, radius = crowd(rng, count, dim)
     x[::2] += apart
     first, second = for_python(neighbours.near_pairs)(
-        no_memory(), x, axis, half, radius, 0.3, DOF[dim]
+        no_memory(), x, axis, half, radius, NONE, 0.3, DOF[dim]
     )
     side = np.abs(axis) * half[:, None] + radius[:, None] + 0.15
     away = (np.abs(x[:, None] - x[None]) - side[:, None] - side[None]).max(2)
@@ -145,9 +146,9 @@ def test_near_pairs_of_some_cells_are_those_of_all_that_have_one(dim, count, sha
     rng = np.random.default_rng(count)
     cells = crowd(rng, count, dim)
     some = (rng.random(count) < share).astype(np.uint8)
-    every = np.stack(for_python(neighbours.near_pairs)(no_memory(), *cells, 0.3, DOF[dim]), 1)
+    every = np.stack(for_python(neighbours.near_pairs)(no_memory(), *cells, NONE, 0.3, DOF[dim]), 1)
     found = np.stack(
-        for_python(neighbours.near_pairs_of)(no_memory(), *cells, 0.3, some, DOF[dim]), 1
+        for_python(neighbours.near_pairs_of)(no_memory(), *cells, NONE, 0.3, some, DOF[dim]), 1
     )
     wanted = every[(some[every] > 0).any(1)]
     assert set(map(tuple, found.tolist())) == set(map(tuple, wanted.tolist()))
@@ -170,7 +171,9 @@ def test_no_cells_come_nearer_than_told(dim, spread, own):
     margin, every = 100.0, np.array(list(itertools.combinations(range(60), 2)), np.int32)
     first, second = every.T.copy()
     near_contacts = for_python(contacts.near_contacts)
-    gaps = lambda: near_contacts(no_memory(), x, axis, half, radius, first, second, margin, dof)[2]
+    gaps = lambda: near_contacts(
+        no_memory(), x, axis, half, radius, NONE, first, second, margin, dof
+    )[2]
     before, length = gaps(), 2 * half
     scale, least = np.ones_like(y), np.zeros(60)
     about, none = np.zeros_like(y), np.zeros((0, 3))
@@ -179,7 +182,10 @@ def test_no_cells_come_nearer_than_told(dim, spread, own):
         x, axis, length, radius, y, scale, about, 1e9, least, no_walls, np.zeros((3, len(dof))), dof
     )
     half = 0.5 * length
-    (all_, each), after = for_python(moves.approach)(no_memory(), x, length, radius, y, dof), gaps()
+    (all_, each), after = (
+        for_python(moves.approach)(no_memory(), x, length, radius, NONE, y, dof),
+        gaps(),
+    )
     told = all_ + each[first] + each[second]
     near = before - all_ - 2 * each.max() < 0.3
     assert near.sum() > 50

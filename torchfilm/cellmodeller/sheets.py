@@ -139,7 +139,7 @@ class _Reader:
             )
             return [[] for _ in range(self.count)]
         i, j, gap = gaps_nearby(
-            s.position, s.axis, s.length, s.radius, s.colony, s.colonies, TOUCHING
+            s.position, s.axis, s.length, s.radius, s.colony, s.colonies, TOUCHING, s.space
         )
         keep = gap <= TOUCHING
         found: list[list[int]] = [[] for _ in range(s.cells)]

@@ -58,8 +58,7 @@ def summary_table(scene: Scene, state: State, timings: Timings, seconds: float) 
 
 def _walls(scene: Scene) -> list[Wall]:
     """The walls of all effects, each once. One wall may have several surfaces."""
-    surfaces = [s for e in scene.effects for s in e.wall_surfaces()]
-    return list({id(surface.wall): surface.wall for surface in surfaces}.values())
+    return list({id(surface.wall): surface.wall for surface in scene.wall_surfaces()}.values())
 
 
 def overlaps_note(cells: Cells) -> str:

@@ -13,12 +13,14 @@ from torch import Tensor
 
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.mechanics_report import MechanicsReport
+from torchfilm.kernels.scheme import MARGIN
 from torchfilm.physics import capsule, compiled, torch_step
 from torchfilm.physics.adhesion import Bonds, holds_of, levels_of, most_of_limits
 from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.contacts import Capsules
 from torchfilm.physics.one_sided_records import OneSidedSettings
-from torchfilm.physics.problem import TOO_STICKY
+from torchfilm.physics.problem import TOO_LONG, TOO_STICKY
+from torchfilm.physics.space import PeriodicSpace
 from torchfilm.physics.step_records import MechanicsInput
 from torchfilm.physics.surfaces import Surface
 from torchfilm.resolver import Resolved, snapshot
@@ -70,6 +72,7 @@ class BoundMechanics(BoundEffect):
         self.drags = [_same(values[n], dtype) for n in ("viscosity", "length_drag")]
         follows = self.compiled and effect.alpha is None and effect.stiffness is None
         self.alphas = compiled.alpha_arrays(None, None, dtype) if follows else None
+        self.space = effect.space
         self.drifts = False
         self.checked_dt: float | None = None  # h, of the last step whose adhesion was checked
 
@@ -151,6 +154,16 @@ class BoundMechanics(BoundEffect):
         status = torch.where(too_strong, TOO_STICKY, report.status)
         return replace(report, status=status)
 
+    def _fitting(
+        self, report: MechanicsReport, state: State, length: Tensor, space: PeriodicSpace
+    ) -> MechanicsReport:
+        """The report, in which colonies fail that have a cell too long for their space. length:
+        (N,) after growth."""
+        reach = max((kind.reach for kind in self.effect.adhesion), default=0.0)
+        too_long = space.too_long(length, state.radius.detach(), MARGIN * state.radius + reach)
+        failed = state.groups.any(too_long).to(report.status.device)
+        return replace(report, status=torch.where(failed, TOO_LONG, report.status))
+
     @property
     def by_kernels(self) -> bool:
         return self.compiled
@@ -174,8 +187,12 @@ class BoundMechanics(BoundEffect):
         report = MechanicsReport(**vars(found.report), substeps=found.substeps)
         if given.bonds is not None:
             report = self._stuck(report, state, given.bonds.levels, dt)
+        position = found.position
+        if self.space is not None:
+            report = self._fitting(report, state, state.length.detach(), self.space)
+            position = self.space.inside(position)
         return state.with_fields(**fields).replace(
-            position=found.position, axis=found.axis, length=found.length,
+            position=position, axis=found.axis, length=found.length,
             reports={**state.reports, "mechanics": report},
         )  # fmt: skip
 
@@ -213,6 +230,9 @@ class BoundMechanics(BoundEffect):
         if self.effect.adhesion:
             assert bonds is not None
             of_step = self._stuck(of_step, state, torch.from_numpy(bonds[0]), dt)
+        if self.space is not None:
+            of_step = self._fitting(of_step, state, torch.from_numpy(length), self.space)
+            x = self.space.inside(x)
         return state.with_fields(**new).replace(
             position=x, axis=axes, length=lengths,
             reports={**state.reports, "mechanics": of_step},
@@ -337,7 +357,8 @@ def _begin(state: State, base: Tensor, drift: Tensor | None) -> Capsules:
     if drift is not None:
         position = position - drift[:, : state.dim].to(position.dtype)
         axis = capsule.rotate(axis, -drift[:, state.dim :])
-    return Capsules(position.T, axis.double().T, 0.5 * base.double(), state.radius.double())
+    half, radius = 0.5 * base.double(), state.radius.double()
+    return Capsules(position.T, axis.double().T, half, radius, state.space)
 
 
 def _tensors(surface: Surface) -> list[Tensor]:

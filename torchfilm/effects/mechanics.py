@@ -6,13 +6,14 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
 
 from torchfilm.effect import MECHANICS, Binding, BoundEffect, Effect
 from torchfilm.effects.bound_mechanics import BoundMechanics
+from torchfilm.effects.mechanics_words import numerics_in_words
 from torchfilm.kernels.bilateral_scheme import CLOSE, PENALTY, TOLERANCE
 from torchfilm.kernels.scheme import OVERLAP, PASSES
 from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
@@ -21,6 +22,7 @@ from torchfilm.physics.adhesion import Adhesion, check_walls_of
 from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.initial_overlaps import check_apart, check_fits, check_room
 from torchfilm.physics.one_sided_records import OneSidedSettings
+from torchfilm.physics.space import PeriodicSpace, check_inside, check_walls_in
 from torchfilm.physics.surfaces import Surface
 from torchfilm.physics.walls import Wall
 from torchfilm.resolver import Values
@@ -28,7 +30,7 @@ from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import check_backend, why_torch
 from torchfilm.tools.row_checks import check_variables
-from torchfilm.values import Rule, Value, checked, is_drawn, numbers, physical, quotient, smallest
+from torchfilm.values import Rule, Value, checked, numbers, physical, quotient, smallest
 
 # The default length drag: free growth, but for bilateral contacts, which do not hold in it.
 LENGTH_DRAG = {"one-sided": 1e5, "bilateral": 10.0}
@@ -42,11 +44,15 @@ class Mechanics(Effect):
     """Cells are capsules that push each other apart; their length is a degree of freedom, so
     pressure may hold growth back.
 
-    walls: what confines them. dim: 3, or 2 for strict 2-D (four degrees of freedom; nothing can
-    leave the plane). viscosity: μ. length_drag: γ, resistance to a change of length, in the unit
-    of μ × µm; it does not follow `viscosity`. A state field `drag` multiplies μ cell by cell. With
-    the default, 1e5, colonies grow at their free rate up to ten thousand cells; with 10, the
-    paper's and the default of bilateral contacts, pressure slows them from a hundred cells on.
+    walls: what confines them. periodic: the faces of axes along which space is periodic, µm, such
+    as {"x": (0, 40)}: what is pushed out at one face comes in at the other, and cells push each
+    other across. Cells must stay shorter than half of the way; only one-sided contacts have it.
+    dim: 3, or 2 for strict 2-D (four degrees of freedom; nothing can leave the plane).
+
+    viscosity: μ. length_drag: γ, resistance to a change of length, in the unit of μ × µm; it does
+    not follow `viscosity`. A state field `drag` multiplies μ cell by cell. With the default, 1e5,
+    colonies grow at their free rate up to ten thousand cells; with 10, the paper's and the default
+    of bilateral contacts, pressure slows them from a hundred cells on.
 
     contacts: "one-sided" (default), which only push, or "bilateral", the paper's least squares,
     which also hold an overlapping pair that would part. One-sided contacts hold at any drag;
@@ -82,6 +88,7 @@ class Mechanics(Effect):
     max_iterations: int = 2000
     max_elongation: float = 0.25
     adhesion: Sequence[Adhesion] = ()
+    periodic: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     backend: str | None = None
 
     stage = MECHANICS
@@ -129,7 +136,19 @@ class Mechanics(Effect):
                 "Mechanics.contact_overlap is for one-sided contacts that follow their force: leave"
                 " it out, or leave out alpha, stiffness and contacts='bilateral'."
             )
-        self.surfaces()  # raises for a wall that does not fit the dimension
+        self._check_space()
+
+    def _check_space(self) -> None:
+        space = PeriodicSpace.of("Mechanics.periodic", self.periodic, self.dim)
+        object.__setattr__(self, "periodic", {} if space is None else space.faces)
+        if space is not None and not self.one_sided:
+            hint = 'Take contacts="one-sided", the default.'
+            raise checks.input_error(
+                "Mechanics.periodic", self.periodic, "left out with bilateral contacts", hint
+            )
+        surfaces = self.surfaces()  # raises for a wall that does not fit the dimension
+        if space is not None:
+            check_walls_in(space, surfaces)
 
     def _check_parts(self, name: str, kind: type, rule: str) -> None:
         given = getattr(self, name)
@@ -144,6 +163,10 @@ class Mechanics(Effect):
     def surfaces(self) -> list[Surface]:
         """What the walls are made of."""
         return [s for wall in self.walls for s in wall.surfaces(self.dim)]
+
+    @property
+    def space(self) -> PeriodicSpace | None:
+        return PeriodicSpace.of("Mechanics.periodic", self.periodic, self.dim)
 
     @property
     def soft_contacts(self) -> bool:
@@ -168,6 +191,7 @@ class Mechanics(Effect):
                 OVERLAP if self.contact_overlap is None else self.contact_overlap,
                 FORCE_TOLERANCE if self.tolerance is None else self.tolerance,
                 self.max_iterations,
+                self.space,
             )
         return ContactSettings.resolve(
             self.dim,
@@ -232,6 +256,8 @@ class Mechanics(Effect):
     def check(self, state: State, values: Values) -> None:
         if state.dim != self.dim:
             raise checks.input_error("Mechanics.dim", self.dim, f"{state.dim}, like the cells")
+        if self.space is not None:
+            check_inside(self.space, state.position, state.own_colony_id, state.uid)
         for kind in self.adhesion:
             check_variables("Adhesion", state, adhesin=kind.adhesin, partner=kind.partner)
         for surface in self.surfaces():
@@ -259,6 +285,7 @@ class Mechanics(Effect):
             state.colony,
             state.colony_id,
             state.uid,
+            self.space,
         )
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
@@ -267,89 +294,7 @@ class Mechanics(Effect):
     # --- what explaining and tuning need -------------------------------------------------
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        settings, text = self.settings, number_range
-        if self.stiffness is not None:
-            alpha = 1.0 / (numbers(self.stiffness) * dt)
-            kind = (
-                f"soft, stiffness {text(numbers(self.stiffness))} μ·µm/h: α = 1/(stiffness·Δt) ="
-                f" {text(alpha)}"
-            )
-        elif self.alpha is not None:
-            kind = f"hard by a penalty, α = {text(numbers(self.alpha))}"
-        elif isinstance(settings, OneSidedSettings):
-            kind = f"as hard as leaves a mean overlap of {settings.contact_overlap:g} radii"
-        else:
-            kind = (
-                f"hard by a penalty, α = {PENALTY:g}/γ ="
-                f" {text(PENALTY / numbers(self.length_drag))} (default)"
-            )
-        if isinstance(settings, OneSidedSettings):
-            lines = self._one_sided_numerics(settings, kind, state.device)
-        else:
-            lines = self._bilateral_numerics(settings, kind, state.device)
-        lines += [_of_adhesion(kind) for kind in self.adhesion]
-        soft = [
-            wall for wall in self.walls if wall.stiffness is not None or wall.weight is not None
-        ]
-        if self.walls:
-            lines.append(
-                f"walls: {len(self.walls) - len(soft)} hard, {len(soft)} with a stiffness or weight"
-            )
-        return lines
-
-    def _one_sided_numerics(
-        self, settings: OneSidedSettings, kind: str, device: torch.device
-    ) -> list[str]:
-        deep = "0.2 radii" if settings.overlap is None else f"{settings.overlap:g} µm"
-        passes = (
-            "1 a step, as cells are soft"
-            if settings.soft
-            else f"at most {settings.passes} a step, more than one only around cells deeper than"
-            f" {deep}"
-        )
-        return [
-            f"contacts: one-sided, they only push; {kind}",
-            (
-                f"passes: {passes}; a colony with a cell that grows more than"
-                f" {self.max_elongation:g} µm takes sub-steps"
-            ),
-            (
-                f"solver: Newton and conjugate gradients, {self._who(device)}, contact forces"
-                f" to {settings.tolerance:g}, at most {self.max_iterations} iterations a solve"
-            ),
-        ]
-
-    def _who(self, device: torch.device) -> str:
-        who = self.backend_on(device)
-        return f"{who}; by torch where gradients are required" if who == "compiled" else who
-
-    def _bilateral_numerics(
-        self, settings: ContactSettings, kind: str, device: torch.device
-    ) -> list[str]:
-        over = (
-            ""
-            if self.overlap is None
-            else f", more than one only for new contacts and overlaps over {self.overlap:g} µm"
-        )
-        return [
-            f"contacts: bilateral, an overlapping pair is held until the next pass; {kind}",
-            (
-                f"passes: at most {settings.passes} a step{over}; a colony with a cell that grows"
-                f" more than {self.max_elongation:g} µm takes sub-steps of up to"
-                f" {settings.coarse_passes} passes"
-            ),
-            (
-                f"solver: conjugate gradients, {self._who(device)}, each colony to a worst residual"
-                f" of {self._tolerance()}, at most {self.max_iterations} iterations"
-            ),
-        ]
-
-    def _tolerance(self) -> str:
-        if self.tolerance is not None:
-            return f"{self.tolerance:g}"
-        default = self.alpha is None and self.stiffness is None
-        less = "" if default else f"; less where α·γ is below {PENALTY:g}"
-        return f"{TOLERANCE:g} (default{less})"
+        return numerics_in_words(self, dt, state.device)
 
     def accuracy_knobs(self) -> Mapping[str, float]:
         penalty = {"penalty": PENALTY} if self.stiffness is None else {}
@@ -424,14 +369,3 @@ def _checked(part: Any) -> Any:
             label = f"{type(part).__name__}.{name}"
             object.__setattr__(own, name, checked(label, given, rule))
     return own
-
-
-def _of_adhesion(kind: Adhesion) -> str:
-    """An adhesion in words, for `explain`."""
-    strength = kind.strength
-    pull = f"{number_range(numbers(strength))} μ·µm²/h"
-    pull = "a strength drawn for each cell" if is_drawn(strength) else f"up to {pull}"
-    levels = " and ".join(kind.levels)
-    by = f", in proportion to {levels}" + " of both cells" * (kind.to == "cells") if levels else ""
-    to = {"cells": "", "walls": " of each end to walls"}.get(str(kind.to), f" to wall {kind.to}")
-    return f"adhesion{to}: a pull of {pull} at a gap of {kind.reach:g} µm{by}"

@@ -8,7 +8,15 @@ from torch import Tensor
 
 from torchfilm.kernels.scheme import BURIED, LONG, MOST_SUBSTEPS
 from torchfilm.physics.contact_records import ContactReport
-from torchfilm.physics.problem import BAD_DRAG, BAD_LENGTH, COLLAPSED, STATUS, TOO_FAST, TOO_STICKY
+from torchfilm.physics.problem import (
+    BAD_DRAG,
+    BAD_LENGTH,
+    COLLAPSED,
+    STATUS,
+    TOO_FAST,
+    TOO_LONG,
+    TOO_STICKY,
+)
 
 # What may help, by status; SOLVE for the others.
 SOLVE = (
@@ -20,6 +28,7 @@ HINTS = {
         "Take a smaller strength, or lower levels of what multiplies it in both cells, or a smaller"
         " dt"
     ),
+    TOO_LONG: "Place the faces of Mechanics.periodic farther apart, or let cells divide earlier",
     BAD_LENGTH: "Check what sets the lengths: a state that was changed, or an effect of your own",
     BAD_DRAG: "Check the effect or rule that sets the field drag",
     COLLAPSED: (
@@ -61,6 +70,11 @@ class MechanicsReport(ContactReport):
             )
         if status == BAD_LENGTH:
             return "the length of a cell is below 0"
+        if status == TOO_LONG:
+            return (
+                "a cell is longer than half of the way between the faces of its periodic space, so"
+                " that it could meet two images of another cell"
+            )
         if status == TOO_STICKY:
             return (
                 "cells stick together more strongly than solves for the contacts allow: strength"

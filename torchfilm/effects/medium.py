@@ -3,6 +3,7 @@ equations 6 and 7)."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -163,6 +164,24 @@ class Medium(Effect):
                 '"error" or "reservoir" with periodic faces',
                 "A periodic box cannot grow.",
             )
+
+    def check_scene(self, effects: Sequence[Effect], founders: Any) -> None:
+        """Raise InputError where cells live in a periodic space and signals do not."""
+        space = next((e.space for e in effects if e.space is not None), None)
+        periodic = self.boundary_of(next(iter(self.signals))).periodic
+        for axis, faces in ({} if space is None else space.faces).items():
+            k = "xyz".index(axis)
+            own = tuple(corner[k] for corner in self.box) if k < len(self.box[0]) else None
+            same = own is not None and all(map(math.isclose, own, faces))
+            if not (periodic[k] and same):
+                is_so = f"ends at {own}" if periodic[k] else "is not"
+                low, high = faces
+                raise checks.InputError(
+                    f"Medium: cells are periodic along {axis}, from {low:g} to {high:g} µm"
+                    f" (Mechanics.periodic), and the medium {is_so}. Give it the same faces: box"
+                    f" from {low:g} to {high:g} along {axis}, and"
+                    f" boundary=tf.BoundaryConditions({axis}=tf.Periodic())."
+                )
 
     def boundary_of(self, name: str) -> BoundaryConditions:
         """The boundary conditions of a signal."""

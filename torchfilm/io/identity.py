@@ -36,7 +36,7 @@ def scene_attributes(scene: Scene, model: Model | None) -> dict[str, str]:
 
 def walls_of(scene: Scene) -> list[dict[str, Any]]:
     """The walls of a scene as plain numbers, as in `Results.walls`."""
-    return [as_data(surface) for effect in scene.effects for surface in effect.wall_surfaces()]
+    return [as_data(surface) for surface in scene.wall_surfaces()]
 
 
 def declared_fields(attributes: Mapping[str, Any]) -> dict[str, list[Any]]:

@@ -26,7 +26,7 @@ from torchfilm.kernels.colonies import (
 )
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.contacts import near_contacts, pair_rows
-from torchfilm.kernels.memory import TOP, give_back
+from torchfilm.kernels.memory import TOP, give_back, zeros
 from torchfilm.kernels.moves import drags
 from torchfilm.kernels.neighbours import near_pairs, spatial_order
 from torchfilm.kernels.rows import (
@@ -97,8 +97,11 @@ def _contacts(memory, x, axis, half, radius, hold, dof):
     """Pairs that overlap, with `hold` also those that are near, and some more: see
     `near_contacts`."""
     margin = 2.0 * max(CANDIDATE, 0.5 * NEAR * hold) * radius.max()
-    first, second = near_pairs(memory, x, axis, half, radius, margin, dof)
-    keep, points, gap = near_contacts(memory, x, axis, half, radius, first, second, margin, dof)
+    none = zeros(memory, (3,), np.float64)  # no axis is periodic
+    first, second = near_pairs(memory, x, axis, half, radius, none, margin, dof)
+    keep, points, gap = near_contacts(
+        memory, x, axis, half, radius, none, first, second, margin, dof
+    )
     return first, second, keep, points, gap
 
 
@@ -212,7 +215,8 @@ def step_colony(memory, x, axis, base, growth, radius, viscosity, length_drag, a
             for i in range(n):
                 for k in range(degrees(dof)):
                     y[i, k] = start[i, k] / scale[i, k]
-        m = pair_rows(memory, x, axis, half, radius, scale, found, walls, rows, 0.0, dof)
+        none = zeros(memory, (3,), np.float64)
+        m = pair_rows(memory, x, axis, half, radius, none, scale, found, walls, rows, 0.0, dof)
         m = _holding_rows(rows, walls, m, radius, hold, soft)
         low = ((base - length) / scale[:, end]).astype(last.dtype)
         y, iterations, error, status = _solved(

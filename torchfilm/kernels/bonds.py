@@ -16,6 +16,7 @@ import numpy as np
 from torchfilm.kernels.batch import put
 from torchfilm.kernels.capsules import closest_points
 from torchfilm.kernels.compiling import kernel, lean
+from torchfilm.kernels.images import nearest
 from torchfilm.kernels.memory import room
 from torchfilm.kernels.moves import rotate
 from torchfilm.kernels.rows import HARD, STIFF, degrees
@@ -86,7 +87,7 @@ def reach_of(bonds, drift, dof):
 
 
 @lean
-def add_bonds(rows, first, end, x, axis, half, radius, scale, bonds, alpha, dof):
+def add_bonds(rows, first, end, x, axis, half, radius, periods, scale, bonds, alpha, dof):
     """Adds rows that pull, after the `end` rows of which those of pairs begin at `first`: one for
     each row at a contact whose cells stick together. Returns how many rows there are. alpha,
     radius: (n,)."""
@@ -97,7 +98,7 @@ def add_bonds(rows, first, end, x, axis, half, radius, scale, bonds, alpha, dof)
             continue
         i, j = one[r], two[r]
         gap = _gap_at_begin(H, gaps, r, i, j, x, axis, half, scale, bonds, dof)
-        stiffness = _stiffness(bonds, i, j, radius[i] + radius[j], gap, dof)
+        stiffness = _stiffness(bonds, i, j, radius[i] + radius[j], periods, gap, dof)
         if stiffness == 0.0:
             continue
         root = math.sqrt(stiffness * 0.5 * (alpha[i] + alpha[j]))
@@ -136,16 +137,16 @@ def _opened(H, h, i, x, axis, half, scale, bonds, dof):
 
 
 @lean
-def _stiffness(bonds, i, j, touching, gap, dof):
+def _stiffness(bonds, i, j, touching, periods, gap, dof):
     """Of the pair of cells i and j, whose radii are `touching`, in a row with this gap; both gaps
     as the step began."""
     levels, reaches, x, axis, half, holds = bonds
     bz, az, cz = 0.0, 0.0, 0.0
     if len(dof) == 8:
-        bz, az, cz = x[j, 2] - x[i, 2], axis[i, 2], axis[j, 2]
+        bz, az, cz = nearest(x[j, 2] - x[i, 2], periods[2]), axis[i, 2], axis[j, 2]
     _, _, square = closest_points(
-        x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], bz, axis[i, 0], axis[i, 1], az,
-        axis[j, 0], axis[j, 1], cz, half[i], half[j], dof,
+        nearest(x[j, 0] - x[i, 0], periods[0]), nearest(x[j, 1] - x[i, 1], periods[1]), bz,
+        axis[i, 0], axis[i, 1], az, axis[j, 0], axis[j, 1], cz, half[i], half[j], dof,
     )  # fmt: skip
     widest, stiffness = max(gap, math.sqrt(square) - touching), 0.0
     for k in range(reaches.shape[0]):

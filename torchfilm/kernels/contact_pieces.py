@@ -30,8 +30,8 @@ NEAR, MAKE_ROWS = 8, 9
 CELLS, NEAR_PAIRS, CONTACTS, WALLS, ROOM = range(BOX + 1, BOX + 6)
 (
     X, AXIS, HALF, RADIUS, SCALE, FIRST, SECOND, KEEP, POINTS, GAP, H, GAPS, ONE, TWO, KIND, BLOCKS,
-    FOUND, MARGIN,
-) = range(BOX + 6, BOX + 24)  # fmt: skip
+    FOUND, MARGIN, PERIODS,
+) = range(BOX + 6, BOX + 25)  # fmt: skip
 
 
 @lean
@@ -41,7 +41,7 @@ def shares(board, cells, many):
 
 
 @kernel
-def _put_cells_on_board(memory, board, x, axis, half, radius, margin):
+def _put_cells_on_board(memory, board, x, axis, half, radius, periods, margin):
     """Tell the team where the cells are. Returns where each piece puts how much it finds."""
     pieces = pieces_for(board, x.shape[0])
     board[PIECES], board[CELLS] = pieces, x.shape[0]
@@ -55,6 +55,7 @@ def _put_cells_on_board(memory, board, x, axis, half, radius, margin):
     board[BLOCKS], board[FOUND], board[MARGIN] = (
         blocks.ctypes.data, found.ctypes.data, box.ctypes.data,
     )  # fmt: skip
+    board[PERIODS] = periods.ctypes.data
     return found
 
 
@@ -68,11 +69,12 @@ def _put_contacts_on_board(board, found):
 
 
 @lean
-def shared_near_contacts(memory, board, x, axis, half, radius, first, second, margin, dof):
+def shared_near_contacts(memory, board, x, axis, half, radius, periods, first, second, margin,
+                         dof):  # fmt: skip
     """The pairs (first, second), and their contacts as `near_contacts` finds them."""
     m = first.shape[0]
     keep, points, gap = room_for_contacts(memory, m)
-    found = _put_cells_on_board(memory, board, x, axis, half, radius, margin)
+    found = _put_cells_on_board(memory, board, x, axis, half, radius, periods, margin)
     _put_contacts_on_board(board, (first, second, keep, points, gap))
     share_out(board, NEAR)
     new = found[0]
@@ -86,12 +88,12 @@ def shared_near_contacts(memory, board, x, axis, half, radius, first, second, ma
 
 
 @lean
-def shared_pair_rows(memory, board, x, axis, half, radius, scale, contacts, walls, rows, margin,
-                     dof):  # fmt: skip
+def shared_pair_rows(memory, board, x, axis, half, radius, periods, scale, contacts, walls, rows,
+                     margin, dof):  # fmt: skip
     """As `pair_rows`."""
     most, m = most_rows(dof), contacts[2].shape[0]
     h, gaps, one, two, kind = rows
-    found = _put_cells_on_board(memory, board, x, axis, half, radius, margin)
+    found = _put_cells_on_board(memory, board, x, axis, half, radius, periods, margin)
     _put_contacts_on_board(board, contacts)
     board[WALLS], board[ROOM], board[SCALE] = walls, gaps.shape[0], scale.ctypes.data
     board[H], board[GAPS], board[KIND] = h.ctypes.data, gaps.ctypes.data, kind.ctypes.data
@@ -131,13 +133,28 @@ def do_contact_piece(board, k, like, dof):
     points = array_at(board, POINTS, np.float64, (contacts, 2))
     gap = array_at(board, GAP, np.float64, (contacts,))
     margin = array_at(board, MARGIN, np.float64, (1,))[0]
+    periods = array_at(board, PERIODS, np.float64, (3,))
     found = array_at(board, FOUND, np.int64, (pieces,))
     block = array_at(board, BLOCKS, np.float64, (pieces * COLUMNS, PAIRS))
     block = block[k * COLUMNS : (k + 1) * COLUMNS]
     begin, end = contacts * k // pieces, contacts * (k + 1) // pieces
     if board[LOOP] == NEAR:
         found[k] = near_contacts_of(
-            x, axis, half, radius, first, second, margin, begin, end, keep, points, gap, block, dof
+            x,
+            axis,
+            half,
+            radius,
+            periods,
+            first,
+            second,
+            margin,
+            begin,
+            end,
+            keep,
+            points,
+            gap,
+            block,
+            dof,
         )
         return
     size = board[ROOM]
@@ -149,6 +166,6 @@ def do_contact_piece(board, k, like, dof):
     )  # fmt: skip
     place = walls + most_rows(dof) * begin
     found[k] = pair_rows_of(
-        x, axis, half, radius, scale, (first, second, keep, points, gap), begin, end, place, rows,
-        margin, block, dof,
+        x, axis, half, radius, periods, scale, (first, second, keep, points, gap), begin, end,
+        place, rows, margin, block, dof,
     )  # fmt: skip

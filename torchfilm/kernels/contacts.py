@@ -21,6 +21,7 @@ from torchfilm.kernels.capsules import (
     squared_sine,
 )
 from torchfilm.kernels.compiling import index, kernel, lean
+from torchfilm.kernels.images import nearest
 from torchfilm.kernels.lanes import put_scaled_row, put_turned
 from torchfilm.kernels.memory import room, shaped
 from torchfilm.kernels.rows import FAR, HARD, half_of
@@ -55,10 +56,10 @@ def most_rows(dof):
 
 
 @lean(inline=True)
-def _put_cells(block, k, i, j, x, axis, half, radius, dof):
+def _put_cells(block, k, i, j, x, axis, half, radius, periods, dof):
     """Puts the cells i and j into column k."""
     for c in range(2 if len(dof) == 4 else 3):
-        block[B + c, k] = x[j, c] - x[i, c]
+        block[B + c, k] = nearest(x[j, c] - x[i, c], periods[c])
         block[A + c, k], block[C + c, k] = axis[i, c], axis[j, c]
     block[HALF_A, k], block[HALF_B, k] = half[i], half[j]
     block[RADIUS_A, k], block[RADIUS_B, k] = radius[i], radius[j]
@@ -125,20 +126,21 @@ def room_for_contacts(memory, most):
 
 
 @lean
-def near_contacts(memory, x, axis, half, radius, first, second, margin, dof):
-    """The pairs nearer than margin: their number, closest points and gap, µm."""
+def near_contacts(memory, x, axis, half, radius, periods, first, second, margin, dof):
+    """The pairs nearer than margin: their number, closest points and gap, µm. periods: see
+    `kernels.images`."""
     m = first.shape[0]
     keep, points, gap = room_for_contacts(memory, m)
     block = new_block(memory, FIRST_ROW)
     found = near_contacts_of(
-        x, axis, half, radius, first, second, margin, 0, m, keep, points, gap, block, dof
+        x, axis, half, radius, periods, first, second, margin, 0, m, keep, points, gap, block, dof
     )
     return keep[:found], points[:found], gap[:found]
 
 
 @lean
-def near_contacts_of(x, axis, half, radius, first, second, margin, begin, end, keep, points, gap,
-                     block, dof):  # fmt: skip
+def near_contacts_of(x, axis, half, radius, periods, first, second, margin, begin, end, keep,
+                     points, gap, block, dof):  # fmt: skip
     """Those of the pairs begin … end − 1, from the place `begin` on. block: see
     `new_block`. Returns how many."""
     found = index(begin)
@@ -146,7 +148,7 @@ def near_contacts_of(x, axis, half, radius, first, second, margin, begin, end, k
         count = min(PAIRS, end - start)
         for k in range(count):
             i, j = index(first[start + k]), index(second[start + k])
-            _put_cells(block, k, i, j, x, axis, half, radius, dof)
+            _put_cells(block, k, i, j, x, axis, half, radius, periods, dof)
         vectors = (count + WIDTH - 1) // WIDTH
         _measure(shaped(block, (FIRST_ROW * VECTORS, WIDTH)), vectors, margin, dof)
         for k in range(count):  # without branches: their outcome is not foreseen
@@ -157,7 +159,7 @@ def near_contacts_of(x, axis, half, radius, first, second, margin, begin, end, k
 
 
 @lean
-def deepest_of(memory, x, axis, half, radius, found, dof):
+def deepest_of(memory, x, axis, half, radius, periods, found, dof):
     """The least gap of the contacts `found` where cells are now, µm, or 0. found: as in
     `pair_rows`."""
     first, second, keep = found[:3]
@@ -166,7 +168,7 @@ def deepest_of(memory, x, axis, half, radius, found, dof):
         some = keep[start : start + PAIRS]
         for k in range(some.shape[0]):
             i, j = index(first[index(some[k])]), index(second[index(some[k])])
-            _put_cells(block, k, i, j, x, axis, half, radius, dof)
+            _put_cells(block, k, i, j, x, axis, half, radius, periods, dof)
         vectors = (some.shape[0] + WIDTH - 1) // WIDTH
         _measure(shaped(block, (FIRST_ROW * VECTORS, WIDTH)), vectors, 0.0, dof)
         for k in range(some.shape[0]):
@@ -342,7 +344,7 @@ def _mark(side, beyond, width):
 
 
 @lean
-def pair_rows(memory, x, axis, half, radius, scale, found, walls, rows, margin, dof):
+def pair_rows(memory, x, axis, half, radius, periods, scale, found, walls, rows, margin, dof):
     """Rows of the contacts `found`, after `walls` others; a line of contact has two rows of weight
     ½, and in space a pair has more where a turn would bring it together: where it is nearer than
     margin. Returns how many there are in all.
@@ -351,11 +353,14 @@ def pair_rows(memory, x, axis, half, radius, scale, found, walls, rows, margin, 
     and the gap, µm: see `near_contacts`.
     """
     block, m = new_block(memory, COLUMNS), found[2].shape[0]
-    return pair_rows_of(x, axis, half, radius, scale, found, 0, m, walls, rows, margin, block, dof)
+    return pair_rows_of(
+        x, axis, half, radius, periods, scale, found, 0, m, walls, rows, margin, block, dof
+    )
 
 
 @lean
-def pair_rows_of(x, axis, half, radius, scale, found, begin, end, place, rows, margin, block, dof):
+def pair_rows_of(x, axis, half, radius, periods, scale, found, begin, end, place, rows, margin,
+                 block, dof):  # fmt: skip
     """Those of the contacts begin … end − 1, from this place on. block: as in `near_contacts_of`.
     Returns the place after them."""
     first, second, keep, points, _ = found
@@ -365,7 +370,7 @@ def pair_rows_of(x, axis, half, radius, scale, found, begin, end, place, rows, m
         some = keep[start : min(start + PAIRS, end)]
         for k in range(some.shape[0]):
             i, j = index(first[index(some[k])]), index(second[index(some[k])])
-            _put_cells(block, k, i, j, x, axis, half, radius, dof)
+            _put_cells(block, k, i, j, x, axis, half, radius, periods, dof)
             block[S0, k], block[T0, k] = points[start + k, 0], points[start + k, 1]
         vectors = (some.shape[0] + WIDTH - 1) // WIDTH
         if _put_rows(shaped(block, (COLUMNS * VECTORS, WIDTH)), vectors, margin, dof):

@@ -66,32 +66,36 @@ def _found_by(memory, numbers, found):
 
 
 @lean
-def found_contacts(memory, team, x, axis, half, radius, margin, dof):
+def found_contacts(memory, team, x, axis, half, radius, periods, margin, dof):
     """Near pairs (first, second), and the contacts among them: see `near_contacts`."""
-    pairs = near_pairs(memory, x, axis, half, radius, margin, dof)
-    return _contacts_among(memory, team, x, axis, half, radius, margin, pairs, dof)
+    pairs = near_pairs(memory, x, axis, half, radius, periods, margin, dof)
+    return _contacts_among(memory, team, x, axis, half, radius, periods, margin, pairs, dof)
 
 
 @lean
-def _contacts_among(memory, team, x, axis, half, radius, margin, pairs, dof):
+def _contacts_among(memory, team, x, axis, half, radius, periods, margin, pairs, dof):
     """The contacts among pairs, which are the first two of `pairs`."""
     first, second = pairs[0], pairs[1]
     if shares(team, x.shape[0], first.shape[0]):
-        return shared_near_contacts(memory, team, x, axis, half, radius, first, second, margin, dof)
-    keep, points, gap = near_contacts(memory, x, axis, half, radius, first, second, margin, dof)
+        return shared_near_contacts(
+            memory, team, x, axis, half, radius, periods, first, second, margin, dof
+        )
+    keep, points, gap = near_contacts(
+        memory, x, axis, half, radius, periods, first, second, margin, dof
+    )
     return first, second, keep, points, gap
 
 
 @lean
-def found_after(memory, team, x, axis, radius, margin, deep, found, arrays, dof):
+def found_after(memory, team, x, axis, radius, periods, margin, deep, found, arrays, dof):
     """The contacts after a move, and whether one of them is deeper than `deep`. Where none is, they
     may be those before it, `found`. Puts the half lengths after it into the arrays."""
     length, _, half, _, _, _, y, _, _ = arrays
     for i in range(half.shape[0]):
         half[i] = 0.5 * length[i]
-    if deepest_of(memory, x, axis, half, radius, found, dof) >= -deep:
+    if deepest_of(memory, x, axis, half, radius, periods, found, dof) >= -deep:
         # others were farther than margin: of those that met, one has come half of the way
-        together, own = approach(memory, x, length, radius, y, dof)
+        together, own = approach(memory, x, length, radius, periods, y, dof)
         some, count = room(memory, own.shape, np.uint8), 0
         for i in range(own.shape[0]):
             some[i] = own[i] > 0.5 * (margin + deep - together)
@@ -99,11 +103,11 @@ def found_after(memory, team, x, axis, radius, margin, deep, found, arrays, dof)
         if count == 0:
             return found, False
         if count <= MOST_SOME * own.shape[0]:
-            pairs = near_pairs_of(memory, x, axis, half, radius, 0.0, some, dof)
-            met = _contacts_among(memory, team, x, axis, half, radius, 0.0, pairs, dof)
+            pairs = near_pairs_of(memory, x, axis, half, radius, periods, 0.0, some, dof)
+            met = _contacts_among(memory, team, x, axis, half, radius, periods, 0.0, pairs, dof)
             if _deepest(met[4]) >= -deep:
                 return found, False
-    found = found_contacts(memory, team, x, axis, half, radius, margin, dof)
+    found = found_contacts(memory, team, x, axis, half, radius, periods, margin, dof)
     return found, _deepest(found[4]) < -deep
 
 

@@ -93,12 +93,13 @@ def bounded(y, i, scale, about, bound, length, scratch, dof):
 
 
 @lean
-def approach(memory, x, length, radius, y, dof):
+def approach(memory, x, length, radius, periods, y, dof):
     """How much nearer, at most, cells can have come by the move y (n, D), µm: any two that
     are near, and what each adds to that, (n,).
 
     Cells of a growing colony move far, but neighbours almost alike: they part in proportion to
-    their distance, and the rest is what each moves by itself.
+    their distance, and the rest is what each moves by itself. Not along an axis that is periodic,
+    where neighbours may lie at opposite faces.
     """
     n, d, end = x.shape[0], 2 if len(dof) == 4 else 3, degrees(dof) - 1
     centre, mean = zeros(memory, (d,), np.float64), zeros(memory, (d,), np.float64)
@@ -111,14 +112,15 @@ def approach(memory, x, length, radius, y, dof):
     along, square = 0.0, 1e-30
     for i in range(n):
         for k in range(d):
-            away = x[i, k] - centre[k]
+            away = x[i, k] - centre[k] if periods[k] == 0.0 else 0.0
             along += away * (y[i, k] - mean[k])
             square += away * away
     stretch, own, most = along / square, room(memory, (n,), np.float64), 0.0
     for i in range(n):
         rest, turn = 0.0, 0.0
         for k in range(d):
-            rest += (y[i, k] - mean[k] - stretch * (x[i, k] - centre[k])) ** 2
+            away = x[i, k] - centre[k] if periods[k] == 0.0 else 0.0
+            rest += (y[i, k] - mean[k] - stretch * away) ** 2
         for k in range(d, end):
             turn += y[i, k] ** 2
         half = 0.5 * (length[i] + abs(y[i, end]))

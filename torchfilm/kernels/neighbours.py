@@ -7,6 +7,13 @@ import math
 import numpy as np
 
 from torchfilm.kernels.compiling import index, kernel, lean
+from torchfilm.kernels.images import (
+    axes_of_images,
+    is_periodic,
+    of_images,
+    pairs_of_cells,
+    with_images,
+)
 from torchfilm.kernels.lanes import boxes_meet, copy_row
 from torchfilm.kernels.memory import copied, room, zeros
 
@@ -97,18 +104,35 @@ def _fill_table(memory, low, high, top, used, boxes, dof):
 
 
 @lean
-def near_pairs(memory, x, axis, half, radius, margin, dof):
-    """Pairs (i < j) whose boxes come nearer than margin, and a few more, each once, sorted by i.
+def near_pairs(memory, x, axis, half, radius, periods, margin, dof):
+    """Pairs (i < j) whose boxes come nearer than margin, and a few more, each once, sorted by i;
+    those of their nearest images where space is periodic, see `kernels.images`."""
+    every = room(memory, (0,), np.uint8)
+    return near_pairs_of(memory, x, axis, half, radius, periods, margin, every, dof)
+
+
+@lean
+def near_pairs_of(memory, x, axis, half, radius, periods, margin, some, dof):
+    """Those of `near_pairs` of which a cell is marked in `some`, (n,) uint8; (0,) for all."""
+    if not is_periodic(periods):
+        return _pairs_between(memory, x, axis, half, radius, margin, some, dof)
+    y, cell, way = with_images(memory, x, axis, half, radius, periods, margin, dof)
+    marks = of_images(memory, some, cell) if some.shape[0] else some
+    first, second = _pairs_between(
+        memory, y, axes_of_images(memory, axis, cell, dof), of_images(memory, half, cell),
+        of_images(memory, radius, cell), margin, marks, dof,
+    )  # fmt: skip
+    first, second = pairs_of_cells(first, second, cell, way)
+    return _by_first(memory, first, second, x.shape[0])
+
+
+@lean
+def _pairs_between(memory, x, axis, half, radius, margin, some, dof):
+    """As `near_pairs_of`, without images.
 
     Cells of any size: a long cell lies in many bins. A pair is found in the first bin that both
     cover: along each axis it is the first of one of them.
     """
-    return near_pairs_of(memory, x, axis, half, radius, margin, room(memory, (0,), np.uint8), dof)
-
-
-@lean
-def near_pairs_of(memory, x, axis, half, radius, margin, some, dof):
-    """Those of `near_pairs` of which a cell is marked in `some`, (n,) uint8; (0,) for all."""
     n, d = x.shape[0], 2 if len(dof) == 4 else 3
     low, high = room(memory, (n, d), np.int64), room(memory, (n, d), np.int64)
     boxes = zeros(memory, (n, len(dof)), np.float32)

@@ -81,4 +81,4 @@ MOST_SUBSTEPS = 1000
 BURIED, MANY, LONG = 0.1, 50, 20
 # The status of a solve or of a step; `physics.problem` has the words.
 CONVERGED, ITERATION_LIMIT, NOT_FINITE, TOO_FAST, BAD_DRAG, COLLAPSED = range(6)
-TOO_STICKY, BAD_LENGTH = 6, 7
+TOO_STICKY, BAD_LENGTH, TOO_LONG = 6, 7, 8

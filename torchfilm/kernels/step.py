@@ -75,7 +75,8 @@ from torchfilm.kernels.wall_moves import move_cells
 
 # Places in the settings. DEEP ≤ 0: TOO_DEEP radii. YIELD: mean overlap
 # of contacts, radii.
-DEEP, TOLERANCE, MOST_PASSES, LIMIT, SOFT, YIELD = range(6)
+# PERIODS: the first of three, see `kernels.images`.
+DEEP, TOLERANCE, MOST_PASSES, LIMIT, SOFT, YIELD, PERIODS = range(7)
 
 
 @lean
@@ -207,9 +208,9 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
     tolerance, given, near = settings[TOLERANCE], alphas.shape[0] > 0, margin + reach[0]
     hardness[0] = hardness[0] if hardness[0] > 0 else limits[0]
     arrays = _arrays(memory, length, growth, shortest, last, walls[4])
-    half, y, kept = arrays[2], arrays[6], arrays[7]
+    periods, half, y, kept = settings[PERIODS:], arrays[2], arrays[6], arrays[7]
     number, deeply, softer, rising, held, kept_alpha = 0, False, 1.0, True, 0.0, 0.0
-    found = found_contacts(memory, team, x, axis, half, radius, near, dof)
+    found = found_contacts(memory, team, x, axis, half, radius, periods, near, dof)
     report[DEEPLY] = 0 if settings[SOFT] > 0 else deeply_overlapping(memory, found, radius)
     top = memory[1][TOP]
     while number < passes:
@@ -221,8 +222,8 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
         if number > 0 and not deeply:  # cells do not lie deep in others; but in a wall?
             if deepest >= -deep:
                 break
-            found, deeply = found_contacts(memory, team, x, axis, half, radius, near, dof), True
-            top = memory[1][TOP]
+            found = found_contacts(memory, team, x, axis, half, radius, periods, near, dof)
+            deeply, top = True, memory[1][TOP]
             continue
         error, e, m = _solved(
             memory, x, axis, radius, found, rows, at_walls, deep, margin, number, arrays, bonds,
@@ -256,7 +257,7 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
         if number < passes:
             give_back(memory, top)
             found, deeply = found_after(
-                memory, team, x, axis, radius, near, deep, found, arrays, dof
+                memory, team, x, axis, radius, periods, near, deep, found, arrays, dof
             )
             top = memory[1][TOP]
         if not deeply and walls[3].shape[0] == 0:
@@ -290,17 +291,17 @@ def _solved(memory, x, axis, radius, found, rows, walls, deep, margin, number, a
     that lie deep and those near them. Returns the error, each row's gap after the move, and how
     many rows there are."""
     _, _, half, (_, root), (alpha, low), scale, y, _, _ = arrays
-    far = margin * (settings[SOFT] <= 0)
+    far, periods = margin * (settings[SOFT] <= 0), settings[PERIODS:]
     some, hops = len(y) * (number > 0), min(HOPS * number, MOST_HOPS)
     numbers, count, mine = deep_cells(memory, found, rows, walls, deep, some, hops)
     if shares(team, x.shape[0], mine[2].shape[0]):
         m = shared_pair_rows(
-            memory, team, x, axis, half, radius, scale, mine, walls, rows, far, dof
+            memory, team, x, axis, half, radius, periods, scale, mine, walls, rows, far, dof
         )
     else:
-        m = pair_rows(memory, x, axis, half, radius, scale, mine, walls, rows, far, dof)
+        m = pair_rows(memory, x, axis, half, radius, periods, scale, mine, walls, rows, far, dof)
     if reach[0] > 0:
-        m = add_bonds(rows, walls, m, x, axis, half, radius, scale, bonds, alpha, dof)
+        m = add_bonds(rows, walls, m, x, axis, half, radius, periods, scale, bonds, alpha, dof)
     if reach[1] > 0:
         m = add_wall_bonds(rows, walls, m, x, axis, half, root, scale, bonds, alpha, dof)
     error, e = _minimise_some(

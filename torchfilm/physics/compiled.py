@@ -119,9 +119,10 @@ def _kernel_of(settings: OneSidedSettings | ContactSettings):
         return of_bilateral, np.array(numbers, dtype=np.float64)
     from torchfilm.kernels.step import step_colonies
 
+    periods = () if settings.space is None else settings.space.period
     numbers = [
         overlap, settings.tolerance, settings.passes, settings.max_iterations, settings.soft,
-        settings.contact_overlap,
+        settings.contact_overlap, *periods, *[0.0] * (3 - len(periods)),
     ]  # fmt: skip
     return step_colonies, np.array(numbers, dtype=np.float64)
 

@@ -6,14 +6,14 @@ pairs is (d, P).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from torchfilm.kernels.bilateral_scheme import CANDIDATE, NEAR
-from torchfilm.physics.neighbours import Neighbourhood
+from torchfilm.physics.space import PeriodicSpace, check_reach, near_pairs
 from torchfilm.physics.stretches import stretch_of
 from torchfilm.tools.reads import rows_where
 from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_sqrt
@@ -28,13 +28,14 @@ class Capsules:
     """Capsules, component first.
 
     centre: (d, N) µm. axis: (d, N) unit. half: (N,) half the centreline length, µm. radius: (N,)
-    µm.
+    µm. space: where they are, if it is periodic.
     """
 
     centre: Tensor
     axis: Tensor
     half: Tensor
     radius: Tensor
+    space: PeriodicSpace | None = None
 
     def take(self, index: Tensor) -> Capsules:
         """The capsules at `index`."""
@@ -43,7 +44,17 @@ class Capsules:
             self.axis.index_select(1, index),
             self.half.index_select(0, index),
             self.radius.index_select(0, index),
+            self.space,
         )
+
+    def pairs(self, first: Tensor, second: Tensor) -> tuple[Capsules, Capsules]:
+        """The capsules of pairs (P,), the second one where it is nearest to the first."""
+        a, b = self.take(first), self.take(second)
+        if self.space is not None:
+            b = replace(
+                b, centre=b.centre + self.space.shift(b.centre.detach() - a.centre.detach())
+            )
+        return a, b
 
 
 @dataclass(frozen=True)
@@ -215,7 +226,7 @@ class CandidateContacts:
     @staticmethod
     def all_of(capsules: Capsules, first: Tensor, second: Tensor) -> CandidateContacts:
         """The given pairs, each (P,)."""
-        a, b = capsules.take(first), capsules.take(second)
+        a, b = capsules.pairs(first, second)
         return CandidateContacts(first, second, a, b, *closest_points(a, b))
 
     @staticmethod
@@ -353,7 +364,7 @@ def gap_at(a: Capsules, b: Capsules, s: Tensor, t: Tensor) -> Tensor:
 
 def contact_gaps(capsules: Capsules, first: Tensor, second: Tensor) -> Tensor:
     """Signed gap of each pair at its closest points, (P,) µm; negative where they overlap."""
-    a, b = capsules.take(first), capsules.take(second)
+    a, b = capsules.pairs(first, second)
     return gap_at(a, b, *closest_points(a, b))
 
 
@@ -366,11 +377,12 @@ def gaps_nearby(
     colony: Tensor,
     colonies: int,
     within: float = 0.0,
+    space: PeriodicSpace | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Pairs of one colony that may be within `within` µm, and their gaps, in float64.
 
-    position, axis: (N, d). length, radius: (N,). colony: (N,) int64. Returns first, second and gap,
-    each (P,).
+    position, axis: (N, d). length, radius: (N,). colony: (N,) int64. space: as of `Capsules`.
+    Returns first, second and gap, each (P,).
     """
     position, axis, length, radius = (
         position.double(),
@@ -378,8 +390,10 @@ def gaps_nearby(
         length.double(),
         radius.double(),
     )
-    first, second = Neighbourhood(position, axis, length, radius, colony, colonies, within).pairs()
-    capsules = Capsules(position.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius)
+    if space is not None:
+        check_reach(space, length, radius, within)
+    first, second = near_pairs(position, axis, length, radius, colony, colonies, within, space)
+    capsules = Capsules(position.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius, space)
     return first, second, contact_gaps(capsules, first, second)
 
 

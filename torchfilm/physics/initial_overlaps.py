@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.physics.space import PeriodicSpace
 from torchfilm.physics.surfaces import FlatSurface, RoundSurface, Surface, per_cell
 from torchfilm.tools.warn_once import warn
 
@@ -25,6 +26,7 @@ def check_apart(
     colony: Tensor,
     colony_id: Tensor,
     uid: Tensor,
+    space: PeriodicSpace | None = None,
 ) -> None:
     """Warn, once for all pairs, if two cells of a colony have the same centre, or overlap by more
     than a radius (the smaller one of the two).
@@ -34,7 +36,7 @@ def check_apart(
     """
     if len(uid) <= 1:
         return
-    i, j, gap = gaps_nearby(position, axis, length, radius, colony, len(colony_id))
+    i, j, gap = gaps_nearby(position, axis, length, radius, colony, len(colony_id), space=space)
     between = (position.index_select(0, i) - position.index_select(0, j)).double()
     least = torch.minimum(radius.index_select(0, i), radius.index_select(0, j)).double()
 

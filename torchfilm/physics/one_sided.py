@@ -33,10 +33,10 @@ from torchfilm.physics.adjoint import attach_gradient
 from torchfilm.physics.contacts import CandidateContacts, Capsules
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.near_rows import near_rows
-from torchfilm.physics.neighbours import Neighbourhood
 from torchfilm.physics.one_sided_solve import Minimum, minimise
 from torchfilm.physics.problem import CONVERGED, ITERATION_LIMIT, NOT_FINITE, ContactProblem
 from torchfilm.physics.solve import warn_if_loose
+from torchfilm.physics.space import near_pairs
 from torchfilm.physics.step_records import StepInput, StepResult
 from torchfilm.physics.wall_contacts import (
     WallContacts,
@@ -156,13 +156,14 @@ class _OneStep:
             held = given.bonds.apart(given.drift, self.groups)
             apart, at_walls = (margin + x.index_select(0, owner) for x in held)
         pick = lambda x: x.detach().index_select(0, rows)
-        near = Neighbourhood(
+        space = given.settings.space
+        near = near_pairs(
             pick(local), pick(axis), pick(length), pick(radius),
-            pick(owner), self.groups.size, pick(apart),
+            pick(owner), self.groups.size, pick(apart), space,
         )  # fmt: skip
-        first, second = (rows.index_select(0, side) for side in near.pairs())
+        first, second = (rows.index_select(0, side) for side in near)
         first, second = torch.minimum(first, second), torch.maximum(first, second)
-        capsules = Capsules(local.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius)
+        capsules = Capsules(local.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius, space)
         found = CandidateContacts.all_of(capsules, first, second)
         last = at.move.detach()[:, : self.dim].double().square().sum(1).sqrt()
         reach = at_walls + last if first_pass else at_walls

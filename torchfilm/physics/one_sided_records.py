@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from torchfilm.physics.space import PeriodicSpace
+
 
 @dataclass(frozen=True)
 class OneSidedSettings:
@@ -12,7 +14,7 @@ class OneSidedSettings:
     dim: 2 or 3. soft: cells have a physical stiffness: one pass. passes: at most this many a step.
     overlap: µm, deeper cells are solved again; None: TOO_DEEP radii. contact_overlap: mean overlap
     that contacts leave, radii. tolerance: relative error of the contact forces. max_iterations: of
-    CG a solve.
+    CG a solve. space: where cells are, if it is periodic.
     """
 
     dim: int
@@ -22,6 +24,7 @@ class OneSidedSettings:
     contact_overlap: float
     tolerance: float
     max_iterations: int
+    space: PeriodicSpace | None = None
 
     @property
     def degrees(self) -> int:

@@ -16,6 +16,7 @@ from torchfilm.kernels.scheme import CONVERGED as CONVERGED
 from torchfilm.kernels.scheme import ITERATION_LIMIT as ITERATION_LIMIT
 from torchfilm.kernels.scheme import NOT_FINITE as NOT_FINITE
 from torchfilm.kernels.scheme import TOO_FAST as TOO_FAST
+from torchfilm.kernels.scheme import TOO_LONG as TOO_LONG
 from torchfilm.kernels.scheme import TOO_STICKY as TOO_STICKY
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.tools.ragged import Groups
@@ -29,6 +30,7 @@ STATUS = {
     COLLAPSED: "leaves too many cells deep in others, step after step",
     BAD_LENGTH: "has a cell whose length is below 0",
     TOO_STICKY: "has cells that stick together too strongly",
+    TOO_LONG: "has a cell that is too long for its periodic space",
 }
 
 
