@@ -29,6 +29,7 @@ SMALL = {
     "repressilator": {"alpha": [216.0, 100.0], "noise": False, "rate": 1.0},
     "toggle_switch": {"strength": [10.0, 12.0], "speed": 2, "molecules_per_unit": 2.0, "rate": 1.0},
     "nutrient_limited": {"supply": [1.0, 2.0], "size": 48.0},
+    "biofilm": {"supply": [1.0, 2.0], "width": 20.0, "height": 30.0, "first": 2},
 }
 
 

@@ -271,6 +271,7 @@ def test_what_is_eaten_times_the_yield_is_what_is_grown():
         "repressilator",
         "toggle_switch",
         "nutrient_limited",
+        "biofilm",
     ],
 )
 def test_every_scene_explains_itself_and_refuses_nonsense(name):

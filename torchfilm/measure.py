@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.contact_forces import bonds_of, pushed_by_cells, pushed_by_walls, softness
+from torchfilm.film_shape import Film, film_of
 from torchfilm.physics.contacts import gaps_nearby
 from torchfilm.physics.surfaces import FlatSurface
 from torchfilm.physics.walls import Wall, depth_in_walls
@@ -209,6 +210,26 @@ def depth(state: State) -> Tensor:
     half = 0.5 * state.length * state.axis[:, 2].abs() + state.radius
     z = state.position[:, 2]
     return state.groups.max(z + half) + state.groups.max(half - z)
+
+
+@of_a_state
+@torch.no_grad()
+def film(
+    state: State,
+    spacing: float = 1.0,
+    *,
+    floor: float = 0.0,
+    across: Mapping[str, tuple[float, float]] | None = None,
+) -> Film:
+    """The shape of a biofilm that grows upwards, along y in the plane and along z in space: its
+    height above each column of a floor, thickness, roughness and coverage. See `Film`.
+
+    spacing: width of a column, µm, or the next smaller one that divides the floor. floor: its y or
+    z, µm. across: from where to where it is measured, µm, such as {"x": (0, 60)}. By default
+    between the faces of a periodic space, and else over the box of the medium.
+    """
+    spacing = checks.number("film(spacing)", spacing, above=0.0)
+    return film_of(state, spacing, checks.number("film(floor)", floor), across)
 
 
 @of_a_state

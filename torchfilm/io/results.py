@@ -149,6 +149,12 @@ class Results(metaclass=checks.KnownKeywords):
         return read_attribute(self.file, "walls", "[]")
 
     @property
+    def periodic(self) -> dict[str, tuple[float, float]]:
+        """The faces of axes along which space is periodic for cells, (low, high) µm."""
+        found = read_attribute(self.file, "periodic", "{}")
+        return {axis: (low, high) for axis, (low, high) in found.items()}
+
+    @property
     def internal_fields(self) -> set[str]:
         """The fields that serve the numerics: `table` shows them only with `internals`."""
         given = self.file.attrs.get("internal")
@@ -180,11 +186,8 @@ class Results(metaclass=checks.KnownKeywords):
         except TypeError as error:
             raise checks.input_error("frame", frame, "a whole number") from error
         if not -len(self) <= frame < len(self):
-            raise checks.input_error(
-                "frame",
-                frame,
-                f"from {-len(self)} to {len(self) - 1}: {self.path} has {len(self)} frames",
-            )
+            rule = f"from {-len(self)} to {len(self) - 1}: {self.path} has {len(self)} frames"
+            raise checks.input_error("frame", frame, rule)
         return frame % len(self)
 
     @partial(checks.known_keywords, instead=BY_NUMBER)
@@ -252,11 +255,8 @@ class Results(metaclass=checks.KnownKeywords):
     def signal(self, name: str, frame: int = -1) -> list[np.ndarray]:
         """Concentrations of a signal at a frame, one array (nx, ny, nz) per colony."""
         if name not in self.signal_names:
-            raise checks.input_error(
-                "signal",
-                name,
-                "one of " + (", ".join(self.signal_names) or "none: the scene has no medium"),
-            )
+            known = ", ".join(self.signal_names) or "none: the scene has no medium"
+            raise checks.input_error("signal", name, f"one of {known}")
         k = self._index(frame)
         _, shapes, _ = self.grid(k)
         ends = int(self._read("frames/grid/first_voxel", k)) + np.concatenate(

@@ -230,6 +230,14 @@ def add_walls(ax: Axes, walls: Sequence[Mapping[str, Any]], colony: int, view: s
             ax.add_artist(Line2D(*ends.T, linestyle=dash, **style))
 
 
+def add_faces(ax: Axes, faces: Mapping[str, tuple[float, float]], view: str) -> None:
+    """Draw the faces of a periodic space as dotted lines, after the walls."""
+    style: Any = {"color": WALL, "linewidth": 0.8, "linestyle": ":", "zorder": 2, "gid": WALL}
+    for k, line in zip(VIEWS[view], (ax.axvline, ax.axhline), strict=True):
+        for at in faces.get("xyz"[k], ()):
+            line(at, **style)
+
+
 def _ends(
     normal: np.ndarray, offset: float, others: Sequence[tuple[np.ndarray, float]]
 ) -> np.ndarray | None:

@@ -27,9 +27,9 @@ class Frame:
     cells: arrays by name as `Results.frame` gives them, the cells of one colony contiguous. time:
     h. colony_id: (B,). units: by name, signals under "out.NAME". signals: by name, one array (nx,
     ny, nz) per colony, on grids with lower corners `origin` (B, 3) and `spacing` (3,), µm. height:
-    z of the plane of 2-D cells, µm, if known. walls: as in `Results.walls`. internal: the
-    quantities that serve the numerics, which messages do not list. names: of the colonies, (B,),
-    for titles; by default their ids.
+    z of the plane of 2-D cells, µm, if known. walls: as in `Results.walls`. faces: of a periodic
+    space, (low, high) µm by axis. internal: the quantities that serve the numerics, which messages
+    do not list. names: of the colonies, (B,), for titles; by default their ids.
     """
 
     cells: Mapping[str, np.ndarray]
@@ -42,6 +42,7 @@ class Frame:
     spacing: np.ndarray | None = None
     height: float | None = None
     walls: Sequence[Mapping[str, Any]] = ()
+    faces: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     internal: Collection[str] = ()
     names: Sequence[str] | None = None
 
@@ -77,9 +78,10 @@ def frame_of(state: State, scene: Scene | None = None) -> Frame:
     units = {f.name: f.unit for f in state.declared.values()}
     ids = state.colony_id.cpu().numpy()
     walls = [] if scene is None else walls_of(scene)
+    faces = {} if state.space is None else state.space.faces
     internal = [f.name for f in state.declared.values() if f.internal]
     if state.layout is None:
-        return Frame(cells, state.time, ids, units, walls=walls, internal=internal)
+        return Frame(cells, state.time, ids, units, walls=walls, faces=faces, internal=internal)
     grid = state.layout.grid
     cuts = grid.offsets.cpu().numpy()[1:-1]
     signals = {
@@ -100,6 +102,7 @@ def frame_of(state: State, scene: Scene | None = None) -> Frame:
         np.asarray(grid.spacing),
         state.layout.height,
         walls,
+        faces,
         internal,
     )
 
@@ -115,6 +118,7 @@ class RecordedFrames(Sequence[Frame]):
         )
         declared = json.loads(results.attributes["declared"])
         self.units, self.walls = {name: entry[1] for name, entry in declared.items()}, results.walls
+        self.faces = results.periodic
         if signal is not None and signal not in results.signal_names:
             raise checks.input_error(
                 "background",
@@ -138,6 +142,7 @@ class RecordedFrames(Sequence[Frame]):
                 ids,
                 self.units,
                 walls=self.walls,
+                faces=self.faces,
                 internal=results.internal_fields,
                 names=_named(results.parameters(place)),
             )
@@ -155,6 +160,7 @@ class RecordedFrames(Sequence[Frame]):
             spacing,
             None if height is None else float(height),
             self.walls,
+            self.faces,
             results.internal_fields,
             _named(results.parameters(place)),
         )

@@ -23,6 +23,7 @@ from torchfilm.pictures.colours import (
 )
 from torchfilm.pictures.draw import (
     add_cells,
+    add_faces,
     add_signal,
     add_walls,
     colour_bar,
@@ -31,7 +32,7 @@ from torchfilm.pictures.draw import (
     set_window,
 )
 from torchfilm.pictures.frames import Frame
-from torchfilm.pictures.shapes import Window, along, box, span, window
+from torchfilm.pictures.shapes import Window, along, box, span, span_of_faces, window, with_images
 from torchfilm.tools import checks
 
 if TYPE_CHECKING:
@@ -95,6 +96,7 @@ def plan_layout(frames: Sequence[Frame], places: Sequence[int], style: PlotStyle
         for place in places:
             cells = frame.colony(place)
             if (new := span(cells, style.view)) is not None:
+                new = span_of_faces(frame.faces, new, style.view)
                 covered[place] = _union(covered.get(place), new)
             for name in style.quantities:
                 if is_rgb(cells, name):
@@ -241,7 +243,9 @@ def fill(ax: Axes, frame: Frame, place: int, layout: PanelLayout, titles: Sequen
     elif layout.style.channels is not None:
         ax.set_facecolor("black")
     add_walls(ax, frame.walls, int(frame.colony_id[place]), layout.style.view)
-    add_cells(ax, cells, layout.scales, layout.style)
+    add_faces(ax, frame.faces, layout.style.view)
+    shown = with_images(cells, frame.faces, layout.style.view, layout.windows[place])
+    add_cells(ax, shown, layout.scales, layout.style)
     whole = ax.figure.get_figwidth()  # type: ignore[union-attr]
     inches = ax.get_position().width * whole + 0.5 * GAP
     ax.set_title(next((t for t in titles if LETTER * len(t) <= inches), ""), fontsize=7, pad=2.5)

@@ -50,6 +50,39 @@ def outlines(
     return np.concatenate(parts, 1)
 
 
+def with_images(
+    cells: Mapping[str, np.ndarray], faces: Mapping[str, tuple[float, float]], view: str,
+    window: Window,
+) -> Mapping[str, np.ndarray]:  # fmt: skip
+    """The cells of a periodic space, and those images of them that reach into a window."""
+    for k, left, right in zip(VIEWS[view], window[0::2], window[1::2], strict=True):
+        if "xyz"[k] not in faces:
+            continue
+        low, high = faces["xyz"[k]]
+        x = cells["position"][:, k]
+        reach = 0.5 * cells["length"] * np.abs(cells["axis"][:, k]) + cells["radius"]
+        left, right = min(left, right), max(left, right)
+        parts = [cells]
+        for shift in (low - high, high - low):
+            seen = (x + shift + reach > left) & (x + shift - reach < right)
+            image = {name: value[seen] for name, value in cells.items()}
+            move = np.eye(cells["position"].shape[1])[k] * shift
+            parts.append({**image, "position": image["position"] + move})
+        cells = {name: np.concatenate([part[name] for part in parts]) for name in cells}
+    return cells
+
+
+def span_of_faces(
+    faces: Mapping[str, tuple[float, float]], covered: np.ndarray, view: str
+) -> np.ndarray:
+    """A box (2, 2) of a view, from face to face of a periodic space, µm."""
+    covered = covered.copy()
+    for column, k in enumerate(VIEWS[view]):
+        if "xyz"[k] in faces:
+            covered[:, column] = faces["xyz"[k]]
+    return covered
+
+
 def span(cells: Mapping[str, np.ndarray], view: str) -> np.ndarray | None:
     """Lower and upper corner (2, 2) of some cells in a view, µm; None without cells."""
     if len(cells["length"]) == 0:

@@ -69,6 +69,7 @@ random_partition = _ready(circuits.random_partition)
 repressilator = _ready(circuits.repressilator)
 toggle_switch = _ready(circuits.toggle_switch)
 nutrient_limited = _ready(nutrients.nutrient_limited)
+biofilm = _ready(nutrients.biofilm)
 
 READY: dict[str, Callable[..., Scene]] = {
     f.__name__: f
@@ -84,6 +85,7 @@ READY: dict[str, Callable[..., Scene]] = {
         repressilator,
         toggle_switch,
         nutrient_limited,
+        biofilm,
     )
 }
 

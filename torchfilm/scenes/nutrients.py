@@ -1,7 +1,11 @@
-"""Colonies whose growth is limited by a nutrient."""
+"""Colonies and biofilms whose growth is limited by a nutrient."""
 
 from __future__ import annotations
 
+import math
+from functools import partial
+
+import numpy as np
 from torch import Tensor
 
 from torchfilm.distributions import Uniform
@@ -10,9 +14,13 @@ from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.medium import Medium
 from torchfilm.effects.nutrition import Monod
+from torchfilm.effects.removal import Removal
 from torchfilm.effects.signal import Signal
+from torchfilm.initial_cells import Cells
+from torchfilm.physics.walls import Plane
 from torchfilm.scene import Scene
-from torchfilm.signals.boundary_conditions import BoundaryConditions, Dirichlet
+from torchfilm.signals.boundary_conditions import BoundaryConditions, Dirichlet, NoFlux, Periodic
+from torchfilm.tools import checks
 
 
 def nutrient_limited(
@@ -46,4 +54,72 @@ def nutrient_limited(
             depth=1.0,
             boundary=BoundaryConditions(x=edge, y=edge),
         ),
+    )
+
+
+# µm: how far below the top of the medium cells are carried away, and the least space between the
+# first cells.
+BELOW, APART = 4.0, 5.0
+
+
+def biofilm(
+    supply: float | Tensor = 1.0,
+    half: float | Tensor = 0.1,
+    diffusion: float | Tensor = 100.0,
+    growth_yield: float | Tensor = 0.2,
+    rate: float | Tensor = 1.0,
+    width: float = 60.0,
+    height: float = 60.0,
+    first: int = 6,
+    spacing: float = 2.0,
+    length_drag: float = 1e5,
+) -> Scene:
+    """A slice of a biofilm on a floor, y = 0, fed from above: periodic along x, so that no edge
+    shapes it (after Picioreanu et al. 1998 and Lardon et al. 2011).
+
+    The nutrient is kept at `supply` at the height of `height` µm. Cells grow by `rate` (1/h) ·
+    s/(half + s), down to a depth of about √(2 · diffusion · s · growth_yield / rate), with the s at
+    the surface. Where that is many cells the film is flat; where it is one or two, bumps shade what
+    lies lower and become fingers. Cells whose centre comes within 4 µm of the top are carried away.
+    width: µm. first: how many cells lie on the floor at the start, in each colony at places of its
+    own, 5 µm apart or more. growth_yield: µm³ of cell from one unit of concentration × µm³. The
+    slice is 1 µm deep, like the cells.
+    """
+    width = checks.number("biofilm(width)", width, above=0.0)
+    height = checks.number("biofilm(height)", height, above=2 * BELOW)
+    first = checks.integer("biofilm(first)", first, least=1)
+    if first * APART > width:
+        most = int(width / APART)
+        rule = f"at most {most} on a floor {width:g} µm wide"
+        raise checks.input_error("biofilm(first)", first, rule)
+    return Scene(
+        Monod("nutrient", rate=rate, half=half, growth_yield=growth_yield),
+        Growth(),
+        Division(length=Uniform(3.5, 4.5)),
+        Mechanics(
+            dim=2,
+            walls=[Plane(y=0.0, facing="+y")],
+            periodic={"x": (0.0, width)},
+            length_drag=length_drag,
+        ),
+        Medium(
+            nutrient=Signal(diffusion=diffusion, initial=supply),
+            box=((0.0, 0.0), (width, height)),
+            spacing=spacing,
+            depth=1.0,
+            boundary=BoundaryConditions(x=Periodic(), y=(NoFlux(), Dirichlet(supply))),
+        ),
+        Removal(low=(-math.inf, -math.inf), high=(math.inf, height - BELOW)),
+        founders=partial(_on_the_floor, first, width),
+        dt=0.05,
+    )
+
+
+def _on_the_floor(count: int, width: float, seed: int) -> Cells:
+    """Cells that lie on the floor, each somewhere in its share of the width."""
+    share = width / count
+    at = np.random.default_rng(seed).uniform(0.5 * APART, share - 0.5 * APART, count)
+    x = share * np.arange(count) + at if share > APART else share * (np.arange(count) + 0.5)
+    return Cells(
+        position=np.stack([x, np.full(count, 0.5)], 1), axis=[[1.0, 0.0]] * count, length=2.0
     )
