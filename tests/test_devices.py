@@ -23,11 +23,11 @@ STEPS = {
     "strain_sorting": 5,
     "random_partition": 8,
     "nutrient_limited": 5,
-    "biofilm": 6,
+    "biofilm": 8,
 }
 SMALL = {
     "strain_sorting": {"cells": 40, "chamber": 10.0},
-    "biofilm": {"width": 16.0, "height": 20.0, "first": 3, "rate": 4.0},
+    "biofilm": {"width": 16.0, "height": 20.0, "first": 3},
 }
 
 
