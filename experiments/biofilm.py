@@ -3,9 +3,9 @@
     OMP_NUM_THREADS=1 python experiments/biofilm.py                     # half a minute
     OMP_NUM_THREADS=1 python experiments/biofilm.py --hours 8 --picture runs/biofilm.png
 
-Colonies of the scene `biofilm`, four for each coefficient, run for 20 h. The script prints thickness
-and roughness of the films every five hours, with the standard deviation over colonies, and the
-speed at which it ran. It draws one colony of each coefficient at the end:
+Colonies of the scene `biofilm`, four for each coefficient, run for 20 h. The script prints
+thickness and roughness of the films every five hours, with the standard deviation over colonies,
+and the speed at which it ran. It draws one colony of each coefficient at the end:
 docs/pictures/biofilm.png.
 """
 
