@@ -131,6 +131,45 @@ def test_a_film_reaches_the_top_and_stays():
     assert float(film.coverage) == 1.0 and 13.0 < float(film.thickness) < 18.0
 
 
+def test_a_box_may_grow_upwards_where_it_is_periodic_at_the_sides():
+    """It starts 8 µm high. New medium has the first concentration: what is there and what cells
+    have eaten is that of the box as it is now; the sides stay."""
+    medium = tf.Medium(
+        food=tf.Signal(diffusion=200.0, initial=1.0), box=((0.0, 0.0), (20.0, 8.0)), spacing=2.0,
+        depth=1.0, boundary=tf.BoundaryConditions(x=tf.Periodic()), outside="grow", grows="+y",
+    )  # fmt: skip
+    scene = tf.Scene(
+        tf.Monod("food", half=0.1, growth_yield=5.0), tf.Growth(), tf.Division(length=3.5),
+        tf.Mechanics(dim=2, walls=[tf.Plane(y=0, facing="+y")], periodic={"x": (0, 20)}), medium,
+        founders=tf.Cells(position=[[1.0, 0.5], [11.0, 0.5]], axis=[[1.0, 0.0]] * 2, length=2.0),
+    )  # fmt: skip
+    eaten = 0.0
+    for state in tf.simulate(scene, until=5.0, dt=0.05):
+        eaten += (
+            float(state.reports["nutrition"].uptake.sum()) if "nutrition" in state.reports else 0
+        )
+    shape = state.layout.grid.shape[0].tolist()
+    assert shape[0] == 10 and shape[1] > 8 and float(state.position[:, 1].max()) > 8.0
+    there = float(state.signals["food"].double().sum()) * 4.0
+    assert there + eaten == pytest.approx(shape[0] * shape[1] * 4.0, rel=1e-5) and eaten > 5.0
+
+
+@pytest.mark.parametrize("layer", (5.0, 12.0))
+def test_the_bulk_follows_the_surface(layer):
+    """The top of the box is at least `layer` above the centre of the highest cell, and at most a
+    voxel more than it has been: it does not come down. The nutrient there is that of the bulk."""
+    scene = tf.scenes.biofilm(diffusion=200.0, width=20.0, first=2, layer=layer)
+    most = 0.0
+    for state in tf.simulate(scene, until=8.0):
+        top = float(state.layout.grid.high[0, 1])
+        if state.step and not state.births:  # daughters are born after the box has grown
+            most = max(most, float(state.position[:, 1].max()))
+            assert most + layer - 1e-6 <= top < most + layer + 4.0
+    assert most > 8.0
+    nutrient = state.signals["nutrient"].view(10, -1)
+    assert float(nutrient[:, -1].min()) > 0.8 and float(nutrient[:, 0].max()) < 0.2
+
+
 def test_too_many_first_cells_are_refused():
     with pytest.raises(tf.InputError, match=r"biofilm\(first\) = 9.*at most 8 on a floor 40 µm"):
         tf.scenes.biofilm(first=9, width=40.0)

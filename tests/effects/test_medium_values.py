@@ -143,7 +143,15 @@ BAD = {
         lambda: tf.Medium(
             ahl=AHL, boundary=tf.BoundaryConditions(x=tf.Periodic()), outside="grow", **GOOD
         ),
-        "periodic box cannot grow",
+        r"Medium\.grows = 'xyz'.*without x: a periodic box cannot grow there.*grows='yz'",
+    ),
+    "margin of a box that does not grow": (
+        lambda: tf.Medium(ahl=AHL, margin=4.0, **GOOD),
+        r"Medium\.margin = 4\.0.*outside='grow'",
+    ),
+    "no margin": (
+        lambda: tf.Medium(ahl=AHL, outside="grow", margin=0.0, **GOOD),
+        r"Medium\.margin",
     ),
     "growing along nothing": (lambda: tf.Medium(ahl=AHL, grows="", **GOOD), r"Medium\.grows"),
     "method": (

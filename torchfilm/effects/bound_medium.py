@@ -35,8 +35,8 @@ from torchfilm.tools.warn_once import warn
 if TYPE_CHECKING:
     from torchfilm.effects.medium import Medium
 
-# A growing grid grows by BLOCK voxels at a time, and keeps MARGIN voxels between the cells and its
-# faces.
+# Unless a margin is given, a growing grid grows by BLOCK voxels at a time, and keeps MARGIN voxels
+# between the cells and its faces.
 BLOCK, MARGIN = 8, 2
 
 
@@ -323,7 +323,9 @@ class GridCoverage(_MediumPart):
         layout = state.layout
         assert layout is not None
         low, high = spans(state.position_3d, state.groups)
-        margin = (MARGIN * layout.grid.step).masked_fill(self.flat, 0.0)
+        given, step = self.effect.margin, layout.grid.step
+        margin = MARGIN * step if given is None else torch.full_like(step, given)
+        margin = margin.masked_fill(self.flat, 0.0)
         low, high = low - margin, high + margin
         fixed_low, fixed_high = self.fixed
         return low.masked_fill(fixed_low, torch.inf), high.masked_fill(fixed_high, -torch.inf)
@@ -344,9 +346,9 @@ class GridCoverage(_MediumPart):
         low, high = torch.where(fits, low, torch.inf), torch.where(fits, high, -torch.inf)
         names = [OUTSIDE + name for name in self.effect.signals]
         here = [state.fields[n] for n in names]
-        grid, values = layout.grid.extended(
-            [*here, torch.ones_like(here[0])], low, high, block=BLOCK
-        )
+        block = BLOCK if self.effect.margin is None else 1
+        here_and_ones = [*here, torch.ones_like(here[0])]
+        grid, values = layout.grid.extended(here_and_ones, low, high, block=block)
         if grid is layout.grid:
             return state
         state = state.replace(layout=layout.on(grid))

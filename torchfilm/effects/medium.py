@@ -3,7 +3,6 @@ equations 6 and 7)."""
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +25,7 @@ from torchfilm.parameters import number_range
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.exchange import turns_error
 from torchfilm.signals.schedule import Schedule, each_value
-from torchfilm.signals.space import check_used, checked_box
+from torchfilm.signals.space import check_growing, check_same_faces, check_used, checked_box
 from torchfilm.signals.transport import COMPILED, METHODS
 from torchfilm.signals.transport_series import MOST
 from torchfilm.state import COLONY, GRID, OUTSIDE, Field, State
@@ -58,7 +57,9 @@ class Medium(Effect):
     with its colony, along the axes in `grows`; with "xy+z" the lower face of z stays, such as at a
     wall on which cells grow. "reservoir": around the box each signal has its `reservoir`
     concentration; the fields NAME_reservoir sum what cells give to it, less what they
-    take.
+    take. margin: how far beyond the centres of its cells a box that grows reaches, µm; it then
+    grows voxel by voxel, so that its face follows a film. Default: two voxels or more, and it grows
+    by eight.
 
     exchange: how circuits and the medium exchange signals. "together": circuits and transport of
     these signals are one equation over the step, of second order, whatever crosses a membrane or a
@@ -87,6 +88,7 @@ class Medium(Effect):
     obstacles: Callable[[Tensor], Tensor] | None = None
     outside: str = "error"
     grows: str = "xyz"
+    margin: float | None = None
     method: str | None = None
     steps: int = 1
     splitting: str = "strang"
@@ -111,6 +113,7 @@ class Medium(Effect):
         obstacles: Callable[[Tensor], Tensor] | None = None,
         outside: str = "error",
         grows: str = "xyz",
+        margin: float | None = None,
         method: str | None = None,
         steps: int = 1,
         splitting: str = "strang",
@@ -120,7 +123,7 @@ class Medium(Effect):
     ):
         _check_signals(signals)
         low, high, voxel = checked_box(box, spacing, depth, height)
-        _check_medium(boundary, outside, grows, method, steps, splitting, obstacles)
+        _check_medium(boundary, outside, grows, margin, method, steps, splitting, obstacles)
         if exchange is not None:
             checks.choice("Medium.exchange", exchange, EXCHANGES)
         check_backend("Medium", backend)
@@ -135,6 +138,7 @@ class Medium(Effect):
             "obstacles": obstacles,
             "outside": outside,
             "grows": grows,
+            "margin": margin,
             "method": method,
             "steps": int(steps),
             "splitting": splitting,
@@ -151,37 +155,20 @@ class Medium(Effect):
         check_used(self)
 
     def _check_periodic(self) -> None:
-        periodic = {self.boundary_of(name).periodic for name in self.signals}
-        if len(periodic) > 1:
+        found = {self.boundary_of(name).periodic for name in self.signals}
+        if len(found) > 1:
             raise checks.InputError(
                 "Medium: a face is periodic for one signal and not for another. Make it periodic"
                 " for all signals or for none."
             )
-        if True in next(iter(periodic)) and self.outside == "grow":
-            raise checks.input_error(
-                "Medium.outside",
-                self.outside,
-                '"error" or "reservoir" with periodic faces',
-                "A periodic box cannot grow.",
-            )
+        check_growing(next(iter(found)), self.outside, self.grows)
 
     def check_scene(self, effects: Sequence[Effect], founders: Any) -> None:
         """Raise InputError where cells live in a periodic space and signals do not."""
-        space = next((e.space for e in effects if e.space is not None), None)
-        periodic = self.boundary_of(next(iter(self.signals))).periodic
-        for axis, faces in ({} if space is None else space.faces).items():
-            k = "xyz".index(axis)
-            own = tuple(corner[k] for corner in self.box) if k < len(self.box[0]) else None
-            same = own is not None and all(map(math.isclose, own, faces))
-            if not (periodic[k] and same):
-                is_so = f"ends at {own}" if periodic[k] else "is not"
-                low, high = faces
-                raise checks.InputError(
-                    f"Medium: cells are periodic along {axis}, from {low:g} to {high:g} µm"
-                    f" (Mechanics.periodic), and the medium {is_so}. Give it the same faces: box"
-                    f" from {low:g} to {high:g} along {axis}, and"
-                    f" boundary=tf.BoundaryConditions({axis}=tf.Periodic())."
-                )
+        faces = [e.space.faces for e in effects if e.space is not None]
+        if faces:
+            periodic = self.boundary_of(next(iter(self.signals))).periodic
+            check_same_faces(faces[0], periodic, self.box)
 
     def boundary_of(self, name: str) -> BoundaryConditions:
         """The boundary conditions of a signal."""
@@ -369,9 +356,12 @@ class Medium(Effect):
     @property
     def coverage(self) -> str:
         """The treatment of cells outside the box, as text."""
+        how = f"{BLOCK} voxels at a time"
+        if self.margin is not None:
+            how = f"voxel by voxel, to {self.margin:g} µm beyond the centres of its cells"
         return {
             "error": "a colony fails if a cell is outside the box",
-            "grow": f"the box grows with its colony along {self.grows}, {BLOCK} voxels at a time",
+            "grow": f"the box grows with its colony along {self.grows}, {how}",
             "reservoir": "cells outside the box meet a reservoir of constant concentration",
         }[self.outside]
 
@@ -410,6 +400,7 @@ def _check_medium(
     boundary: object,
     outside: str,
     grows: object,
+    margin: object,
     method: str | None,
     steps: object,
     splitting: str,
@@ -423,6 +414,10 @@ def _check_medium(
             grows,
             'some of the letters x, y and z, with a sign for one face alone, such as "xy+z"',
         )
+    if margin is not None:
+        checks.number("Medium.margin", margin, above=0.0)
+        if outside != "grow":
+            raise checks.input_error("Medium.margin", margin, "left out but with outside='grow'")
     if method is not None:
         checks.choice("Medium.method", method, tuple(METHODS))
     checks.integer("Medium.steps", steps, least=1)

@@ -71,23 +71,32 @@ def biofilm(
     width: float = 60.0,
     height: float = 60.0,
     first: int = 6,
+    layer: float | None = None,
     spacing: float = 2.0,
     length_drag: float = 1e5,
 ) -> Scene:
     """A slice of a biofilm on a floor, y = 0, fed from above: periodic along x, so that no edge
     shapes it (after Picioreanu et al. 1998 and Lardon et al. 2011).
 
-    The nutrient is kept at `supply` at the height of `height` µm. Cells grow by `rate` (1/h) ·
-    s/(half + s), down to a depth of about √(2 · diffusion · s · growth_yield / rate), with the s at
-    the surface. Where that is many cells the film is flat; where it is one or two, bumps shade what
-    lies lower and become fingers. Cells whose centre comes within 4 µm of the top are carried away.
+    The nutrient is kept at `supply` at the height of `height` µm, or, with a `layer`, so many µm
+    above the centre of the highest cell, to a voxel: what mixes above is the bulk. Cells grow by
+    `rate` (1/h) · s/(half + s), down to a depth of about √(2 · diffusion · s · growth_yield /
+    rate), with the s at the surface. Where that is many cells the film is flat; where it is one or
+    two, bumps shade what lies lower and become fingers. Cells whose centre comes within 4 µm of
+    `height` are carried away.
+
     width: µm. first: how many cells lie on the floor at the start, in each colony at places of its
     own, 5 µm apart or more. growth_yield: µm³ of cell from one unit of concentration × µm³. The
     slice is 1 µm deep, like the cells.
     """
     width = checks.number("biofilm(width)", width, above=0.0)
     height = checks.number("biofilm(height)", height, above=2 * BELOW)
+    spacing = checks.number("biofilm(spacing)", spacing, above=0.0)
     first = checks.integer("biofilm(first)", first, least=1)
+    top = height
+    if layer is not None:
+        layer = checks.number("biofilm(layer)", layer, above=0.0)
+        top = spacing * math.ceil((1.0 + layer) / spacing)
     if first * APART > width:
         most = int(width / APART)
         rule = f"at most {most} on a floor {width:g} µm wide"
@@ -104,10 +113,13 @@ def biofilm(
         ),
         Medium(
             nutrient=Signal(diffusion=diffusion, initial=supply),
-            box=((0.0, 0.0), (width, height)),
+            box=((0.0, 0.0), (width, top)),
             spacing=spacing,
             depth=1.0,
             boundary=BoundaryConditions(x=Periodic(), y=(NoFlux(), Dirichlet(supply))),
+            outside="error" if layer is None else "grow",
+            grows="xyz" if layer is None else "+y",
+            margin=layer,
         ),
         Removal(low=(-math.inf, -math.inf), high=(math.inf, height - BELOW)),
         founders=partial(_on_the_floor, first, width),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torch import Tensor
@@ -96,6 +97,39 @@ def checked_flow(name: str, given: Any) -> Any:
             "For one velocity per colony give (vx, vy), each a tensor with one number per colony.",
         )
     return tuple(checks.value(f"{name}[{k}]", v) for k, v in enumerate(given))
+
+
+def check_growing(periodic: Sequence[bool], outside: str, grows: str) -> None:
+    """Raise InputError for a box that would grow along an axis that is periodic."""
+    along = [a for a, wraps in zip("xyz", periodic, strict=True) if wraps]
+    if outside == "grow" and any(a in grows for a in along):
+        left = "".join(a for a in "xyz" if a not in along)
+        raise checks.input_error(
+            "Medium.grows",
+            grows,
+            f"without {' and '.join(along)}: a periodic box cannot grow there",
+            f"The others may: grows={left!r}." if left else 'Take outside="error".',
+        )
+
+
+def check_same_faces(
+    faces: Mapping[str, tuple[float, float]], periodic: Sequence[bool],
+    box: tuple[Sequence[float], Sequence[float]],
+) -> None:  # fmt: skip
+    """Raise InputError where space is periodic for cells and not for signals. faces: of the cells,
+    (low, high) µm by axis. periodic: of the signals. box: of the medium."""
+    for axis, (low, high) in faces.items():
+        k = "xyz".index(axis)
+        own = tuple(corner[k] for corner in box) if k < len(box[0]) else None
+        if periodic[k] and own is not None and all(map(math.isclose, own, (low, high))):
+            continue
+        is_so = f"ends at {own}" if periodic[k] else "is not"
+        raise checks.InputError(
+            f"Medium: cells are periodic along {axis}, from {low:g} to {high:g} µm"
+            f" (Mechanics.periodic), and the medium {is_so}. Give it the same faces: box from"
+            f" {low:g} to {high:g} along {axis}, and"
+            f" boundary=tf.BoundaryConditions({axis}=tf.Periodic())."
+        )
 
 
 def check_used(medium: Any) -> None:
