@@ -283,7 +283,10 @@ def difference(one: tf.State, other: tf.State) -> float:
     apart = torch.zeros_like(one.position[:, 0])
     for sign in (-1, 1):
         ends = [s.position + 0.5 * sign * (s.length.unsqueeze(1) * s.axis) for s in (one, other)]
-        apart = torch.maximum(apart, (ends[0] - ends[1]).norm(dim=1))
+        between = (ends[0] - ends[1]).T
+        if one.space is not None:
+            between = between + one.space.shift(between)
+        apart = torch.maximum(apart, between.norm(dim=0))
     return float((apart / one.radius).max()) if one.cells else 0.0
 
 

@@ -56,6 +56,7 @@ class Contacts:
     length drag and softness. elongation: µm in a sub-step, one-sided contacts only. tolerance: None
     for the default. drags: length drag and viscosity of each colony, in place of those of all; none
     if empty. sticks: strength of adhesion over viscosity · reach / Δt, µm; one-sided contacts only.
+    periodic: the axes along which space is periodic; without walls and a medium only.
     """
 
     give: float | None
@@ -71,6 +72,7 @@ class Contacts:
     tolerance: float | None = None
     drags: tuple[tuple[float, float], ...] = ()
     sticks: float = 0.0
+    periodic: str = ""
 
 
 @dataclass(frozen=True)
@@ -286,7 +288,13 @@ SCENES = st.builds(
 PUSHING = st.builds(
     Draw,
     capsules=CAPSULES,
-    contacts=CONTACTS.map(lambda c: replace(c, contacts="one-sided")),
+    contacts=st.builds(
+        lambda c, axes: replace(
+            c, contacts="one-sided", wall=None if axes else c.wall, periodic=axes
+        ),
+        CONTACTS,
+        st.sampled_from(["", "", "", "x", "xy"]),
+    ),
     growing=st.none() | GROWING,
     outside=st.none(),
     inside=st.none(),

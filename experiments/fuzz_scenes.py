@@ -83,8 +83,11 @@ def mechanics(draw: Contacts, capsules: Capsules, dt: float) -> tf.Mechanics:
     if draw.drags:
         columns = zip(*draw.drags[: len(capsules.counts)], strict=True)
         length_drag, viscosity = (torch.tensor(x, dtype=torch.float64) for x in columns)
+    # far enough apart for the first cells; those that outgrow half of the way fail their colony
+    side = max(capsules.within + draw.margin, 2.5 * (capsules.lengths[1] + 3 * capsules.radii[1]))
     made = tf.Mechanics(
         walls=walls(draw, capsules),
+        periodic={axis: (-side, side) for axis in draw.periodic},
         dim=capsules.dim,
         viscosity=each(draw, viscosity),
         length_drag=each(draw, length_drag),
