@@ -22,7 +22,7 @@ import torchfilm as tf
 from torchfilm import pictures
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "biofilm.png"
-DIFFUSION, REPLICATES, SEED = (5.0, 20.0, 100.0, 1000.0), 4, 0
+DIFFUSION, REPLICATES, SEED = (1e3, 3e3, 1e4, 1e5), 4, 0
 
 
 def in_words(of_colonies: Tensor) -> str:

@@ -84,8 +84,10 @@ def test_growth_falls_with_depth_as_diffusion_and_uptake_say():
     """A flat film: D s″ = φ(y) · rate · s/(half + s) / yield, with φ the part of each layer that
     cells fill, the nutrient at the top and no flux at the floor. Cells in each layer grow as the
     solution of the one-dimensional equation says."""
-    width, height, diffusion, half, made = 20.0, 40.0, 1000.0, 0.1, 0.2
-    state = grown(11.0, width=width, height=height, diffusion=diffusion, half=half, first=3)
+    width, height, diffusion, half, made = 20.0, 40.0, 1e5, 0.1, 2e-3
+    state = grown(
+        11.0, width=width, height=height, layer=None, diffusion=diffusion, half=half, first=3
+    )
     film = tf.measure.film(state)
     assert float(film.roughness) < 0.15 and float(film.thickness) > 15
     y, volume = state.position[:, 1].numpy(), state.volume.double().numpy()
@@ -112,9 +114,19 @@ def test_growth_falls_with_depth_as_diffusion_and_uptake_say():
 def test_slow_diffusion_makes_fingers():
     """Where the nutrient reaches only the first cell, a film is rough; where it reaches many it is
     flat (Picioreanu et al. 1998)."""
-    state = grown(14.0, diffusion=[5.0, 1000.0], width=40.0, first=4, height=48.0)
-    slow, fast = tf.measure.film(state).roughness.tolist()
-    assert slow > 0.15 and fast < 0.1 and slow > 4 * fast
+    state = grown(18.0, diffusion=[2e3] * 3 + [1e5] * 3, height=40.0)
+    slow, fast = tf.measure.film(state).roughness.view(2, 3).mean(1).tolist()
+    assert slow > 0.15 and fast < 0.06 and slow > 4 * fast
+
+
+def test_only_the_product_of_diffusion_and_yield_matters():
+    """A hundredth of the yield at a hundred times the diffusion: the film is as thick."""
+    parts = [
+        grown(8.0, diffusion=2e4 * k, growth_yield=2e-3 / k, width=24.0, first=3, height=40.0)
+        for k in (1.0, 100.0)
+    ]
+    one, other = (float(part.volume.sum()) for part in parts)
+    assert one > 100.0 and other == pytest.approx(one, rel=0.05)
 
 
 def test_a_film_reaches_the_top_and_stays():
@@ -122,7 +134,7 @@ def test_a_film_reaches_the_top_and_stays():
     covered."""
     left = 0
     for state in tf.simulate(tf.scenes.biofilm(
-        diffusion=1000.0, width=16.0, height=20.0, first=2), until=14.0
+        diffusion=1e5, width=16.0, height=20.0, first=2), until=14.0
     ):  # fmt: skip
         left += sum(len(e.uid) for e in state.ended if e.fate == "left")
         last = state
@@ -158,7 +170,7 @@ def test_a_box_may_grow_upwards_where_it_is_periodic_at_the_sides():
 def test_the_bulk_follows_the_surface(layer):
     """The top of the box is at least `layer` above the centre of the highest cell, and at most a
     voxel more than it has been: it does not come down. The nutrient there is that of the bulk."""
-    scene = tf.scenes.biofilm(diffusion=200.0, width=20.0, first=2, layer=layer)
+    scene = tf.scenes.biofilm(diffusion=2e4, width=20.0, first=2, layer=layer)
     most = 0.0
     for state in tf.simulate(scene, until=8.0):
         top = float(state.layout.grid.high[0, 1])
@@ -170,6 +182,12 @@ def test_the_bulk_follows_the_surface(layer):
     assert float(nutrient[:, -1].min()) > 0.8 and float(nutrient[:, 0].max()) < 0.2
 
 
-def test_too_many_first_cells_are_refused():
+def test_what_does_not_make_a_biofilm_is_refused():
+    with pytest.raises(
+        tf.InputError, match=r"biofilm\(width\) = 41.*a whole number of voxels of 2"
+    ):
+        tf.scenes.biofilm(width=41.0)
+    with pytest.raises(tf.InputError, match=r"biofilm\(width\) = 8.*12"):
+        tf.scenes.biofilm(width=8.0, first=1)
     with pytest.raises(tf.InputError, match=r"biofilm\(first\) = 9.*at most 8 on a floor 40 µm"):
         tf.scenes.biofilm(first=9, width=40.0)

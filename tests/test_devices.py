@@ -23,7 +23,7 @@ STEPS = {
     "strain_sorting": 5,
     "random_partition": 8,
     "nutrient_limited": 5,
-    "biofilm": 8,
+    "biofilm": 4,
 }
 SMALL = {
     "strain_sorting": {"cells": 40, "chamber": 10.0},

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from torchfilm.physics.adhesion import Bonds, holds_of, levels_of
-from torchfilm.physics.contacts import CandidateContacts, Capsules, gaps_nearby
+from torchfilm.physics.contacts import CandidateContacts, Capsules
 from torchfilm.physics.near_rows import near_rows
+from torchfilm.physics.nearby import gaps_nearby
 from torchfilm.physics.wall_contacts import find_wall_contacts
 from torchfilm.physics.walls import Wall
 from torchfilm.state import State

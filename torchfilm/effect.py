@@ -248,7 +248,7 @@ class Effect(metaclass=checks.KnownKeywords):
         return ()
 
     @property
-    def space(self) -> PeriodicSpace | None:
+    def periodic_space(self) -> PeriodicSpace | None:
         """Where cells are, if periodic."""
         return None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -21,8 +22,8 @@ class Film:
     """The film of each colony. height: (B, C) float64 µm, of the highest cell above the middle of
     each of C columns of the floor, 0 where there is none; in space (B, CX, CY). thickness: (B,)
     their mean. roughness: (B,) the mean of |height − thickness| over the thickness, 0 for a flat
-    film (Heydorn et al., Microbiology 146, 2395, 2000); NaN without cells. coverage: (B,) the
-    share of the columns in which there is a cell."""
+    film (Heydorn et al., Microbiology 146, 2395, 2000); NaN without cells on the floor. coverage:
+    (B,) the share of the columns in which there is a cell."""
 
     height: Tensor
     thickness: Tensor
@@ -34,9 +35,13 @@ def film_of(
     state: State, spacing: float, floor: float, across: Mapping[str, tuple[float, float]] | None
 ) -> Film:
     """See `measure.film`."""
-    ground = AXES[: state.dim - 1]
+    ground, upward = AXES[: state.dim - 1], AXES[state.dim - 1]
+    if state.space is not None and upward in state.space.faces:
+        raise checks.InputError(
+            f"film measures height along {upward}, and space is periodic there: there is no floor."
+        )
     spans = _spans(state, ground, across)
-    counts = [max(1, round((high - low) / spacing)) for low, high in spans]
+    counts = [max(1, math.ceil((high - low) / spacing - 1e-9)) for low, high in spans]
     steps = [(high - low) / count for (low, high), count in zip(spans, counts, strict=True)]
     points, radius, colony = _spheres(state)
     spread = [int((float(radius.max()) if len(radius) else 0.0) / step) + 1 for step in steps]
@@ -75,9 +80,14 @@ def _spans(
     if state.layout is not None:
         grid = state.layout.grid
         step = torch.tensor(grid.spacing, dtype=torch.float64, device=state.device)
-        low, high = grid.origin.amin(0), (grid.origin + grid.shape * step).amax(0)
-        found |= {a: (float(low[k]), float(high[k])) for k, a in enumerate(ground)}
+        low, high = grid.origin, grid.origin + grid.shape * step
+        for k, axis in enumerate(ground):
+            if bool((low[:, k] == low[0, k]).all() & (high[:, k] == high[0, k]).all()):
+                found[axis] = float(low[0, k]), float(high[0, k])
     found |= {} if state.space is None else state.space.faces
+    if across is not None and not isinstance(across, Mapping):
+        rule = 'a dict of axes and spans in µm, such as {"x": (0, 40)}'
+        raise checks.input_error("film(across)", across, rule)
     for axis, span in (across or {}).items():
         if axis not in tuple(ground):
             raise checks.input_error("film(across), axis", axis, " or ".join(map(repr, ground)))
@@ -92,8 +102,9 @@ def _spans(
         found[axis] = low_end, high_end
     if missing := [a for a in ground if a not in found]:
         raise checks.InputError(
-            f"film does not know how far the floor reaches along {' and '.join(missing)}: the state"
-            " has no medium, and is not periodic there. Give it, such as"
+            f"film does not know how far the floor reaches along {' and '.join(missing)}: space is"
+            " not periodic there, and there is no medium that is as wide in all colonies. Give it,"
+            " such as"
             f" across={{{missing[0]!r}: (0, 40)}}."
         )
     return [found[a] for a in ground]

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.physics.nearby import gaps_nearby
+from torchfilm.physics.space import Faces, PeriodicSpace
 from torchfilm.physics.walls import Wall
 from torchfilm.state import CELL_TYPE, RESERVED, Field, State
 from torchfilm.tools import checks, displays
@@ -178,21 +179,18 @@ class Cells(metaclass=checks.KnownKeywords):
             )
         return state
 
-    def overlaps(self, depth: float = 0.0) -> list[tuple[int, int, float]]:
-        """Pairs of cells that overlap by more than `depth` µm, deepest first: (cell, cell, µm)."""
+    def overlaps(
+        self, depth: float = 0.0, *, periodic: Faces | None = None
+    ) -> list[tuple[int, int, float]]:
+        """Pairs of cells that overlap by more than `depth` µm, deepest first: (cell, cell, µm).
+        periodic: as of `Mechanics`."""
+        space = PeriodicSpace.of("Cells.overlaps(periodic)", periodic, self.dim)
         t = lambda x: torch.as_tensor(np.array(x))
-        position, axis, length, radius = (
-            t(self.position),
-            t(self.axis),
-            t(self.length),
-            t(self.radius),
-        )
-        colony = (
-            t(self.colony)
-            if self.colony is not None
-            else torch.zeros(self.count, dtype=torch.int64)
-        )
-        i, j, gap = gaps_nearby(position, axis, length, radius, colony, self.colonies)
+        position, axis = t(self.position), t(self.axis)
+        length, radius = t(self.length), t(self.radius)
+        one = torch.zeros(self.count, dtype=torch.int64)
+        colony = one if self.colony is None else t(self.colony)
+        i, j, gap = gaps_nearby(position, axis, length, radius, colony, self.colonies, space=space)
         order = torch.argsort(gap)
         return [(int(i[k]), int(j[k]), -float(gap[k])) for k in order.tolist() if gap[k] < -depth]
 
@@ -332,17 +330,19 @@ class Cells(metaclass=checks.KnownKeywords):
         _warn_of_empty(cells)
         return cells
 
-    def relaxed(self, depth: float = 0.01, walls: Sequence[Wall] = ()) -> Cells:
+    def relaxed(
+        self, depth: float = 0.01, walls: Sequence[Wall] = (), *, periodic: Faces | None = None
+    ) -> Cells:
         """The same cells, pushed apart until none overlap by more than `depth` µm, and out of the
-        walls of a scene, soft ones too: `cells.relaxed(walls=[tf.Channel(…)])`. Lengths and radii
-        do not change; one-sided contacts move and turn the cells. `summary` says how far cells of a
-        micrograph moved.
+        walls of a scene, soft ones too: `cells.relaxed(walls=[tf.Channel(…)])`. periodic: as of
+        `Mechanics`. Lengths and radii do not change; one-sided contacts move and turn the cells.
+        `summary` says how far cells of a micrograph moved.
 
         Raises SimulationError if they still overlap after 200 steps.
         """
         from torchfilm.micrographs.relaxing import relax
 
-        return relax(self, depth, walls)
+        return relax(self, depth, walls, periodic)
 
     def table(self) -> dict[str, np.ndarray]:
         """The cells as columns (N,) with their units in the names, for `from_table`, for

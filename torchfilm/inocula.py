@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from torchfilm.initial_cells import Cells
-from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.physics.nearby import gaps_nearby
 from torchfilm.tools import checks
 
 ROUNDS = 2000  # in which cells that overlap others are placed again

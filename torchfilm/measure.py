@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchfilm.contact_forces import bonds_of, pushed_by_cells, pushed_by_walls, softness
 from torchfilm.film_shape import Film, film_of
-from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.physics.nearby import gaps_nearby
 from torchfilm.physics.surfaces import FlatSurface
 from torchfilm.physics.walls import Wall, depth_in_walls
 from torchfilm.state import CELL, State
@@ -226,7 +226,8 @@ def film(
 
     spacing: width of a column, µm, or the next smaller one that divides the floor. floor: its y or
     z, µm. across: from where to where it is measured, µm, such as {"x": (0, 60)}. By default
-    between the faces of a periodic space, and else over the box of the medium.
+    between the faces of a periodic space, else over the box of the medium, if it is as wide in all
+    colonies.
     """
     spacing = checks.number("film(spacing)", spacing, above=0.0)
     return film_of(state, spacing, checks.number("film(floor)", floor), across)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.circuits.names import Names
-from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.physics.nearby import gaps_nearby
 from torchfilm.rule_draws import Draws, OneCell
 from torchfilm.rule_values import RuleError, as_tensor, broadcast_copy, check_integers, real_column
 from torchfilm.state import CELL, CELL_TYPE, COLONY, OUTSIDE, Field, State

@@ -208,7 +208,8 @@ class Scene(metaclass=checks.KnownKeywords):
     @property
     def space(self) -> PeriodicSpace | None:
         """Where cells are, if that is periodic."""
-        return next((e.space for e in self.effects if e.space is not None), None)
+        found = (effect.periodic_space for effect in self.effects)
+        return next((space for space in found if space is not None), None)
 
     def wall_surfaces(self) -> list[Surface]:
         """The surfaces of all walls."""

@@ -31,7 +31,7 @@ from torch import Tensor
 
 import torchfilm as tf
 from torchfilm.kernels.scheme import OVERLAP, PASSES, TOLERANCE
-from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.physics.nearby import gaps_nearby
 
 SEED = 1
 

@@ -11,7 +11,7 @@ import torchfilm as tf
 from torchfilm.physics import contact_step
 from torchfilm.physics.contact_records import CellProperties, Moved
 from torchfilm.physics.contact_search import find_contacts, unresolved_contacts
-from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.physics.nearby import gaps_nearby
 from torchfilm.physics.problem import CONVERGED
 
 # Sixty short rods at random in a box of 5 µm: the first moves would turn some of them by far more

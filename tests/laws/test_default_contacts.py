@@ -16,7 +16,7 @@ import torch
 
 import torchfilm as tf
 from torchfilm import measure
-from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.physics.nearby import gaps_nearby
 
 sys.path.append(str(Path(__file__).parents[2] / "experiments"))
 import solve_error

@@ -14,7 +14,8 @@ import torchfilm as tf
 from torchfilm.kernels import moves, neighbours
 from torchfilm.kernels.compiling import for_python
 from torchfilm.kernels.memory import no_memory
-from torchfilm.physics.contacts import Capsules, contact_gaps, gaps_nearby
+from torchfilm.physics.contacts import Capsules, contact_gaps
+from torchfilm.physics.nearby import gaps_nearby
 from torchfilm.physics.space import PeriodicSpace, near_pairs
 
 DOF = {2: (0,) * 4, 3: (0,) * 8}

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchfilm.cellmodeller.cell import READ_ONLY, UNSET, Cell, Sheet, written
 from torchfilm.cellmodeller.rates import SIGNAL, SPECIES
 from torchfilm.cellmodeller.variables import COLOR, FIELDS, GREY, Variable
-from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.physics.nearby import gaps_nearby
 from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.warn_once import warn

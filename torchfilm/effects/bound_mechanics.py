@@ -72,7 +72,7 @@ class BoundMechanics(BoundEffect):
         self.drags = [_same(values[n], dtype) for n in ("viscosity", "length_drag")]
         follows = self.compiled and effect.alpha is None and effect.stiffness is None
         self.alphas = compiled.alpha_arrays(None, None, dtype) if follows else None
-        self.space = effect.space
+        self.space = effect.periodic_space
         self.drifts = False
         self.checked_dt: float | None = None  # h, of the last step whose adhesion was checked
 
@@ -159,8 +159,11 @@ class BoundMechanics(BoundEffect):
     ) -> MechanicsReport:
         """The report, in which colonies fail that have a cell too long for their space. length:
         (N,) after growth."""
-        reach = max((kind.reach for kind in self.effect.adhesion), default=0.0)
-        too_long = space.too_long(length, state.radius.detach(), MARGIN * state.radius + reach)
+        kinds, radius = self.effect.adhesion, state.radius.detach().double()
+        mean = state.groups.sum(radius) / state.counts.clamp(min=1)
+        reach = MARGIN * mean.index_select(0, state.colony)
+        reach = reach + max((kind.reach for kind in kinds if kind.to == "cells"), default=0.0)
+        too_long = space.too_long(length.to(radius.device), radius, reach)
         failed = state.groups.any(too_long).to(report.status.device)
         return replace(report, status=torch.where(failed, TOO_LONG, report.status))
 

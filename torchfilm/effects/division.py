@@ -357,7 +357,8 @@ def divide(
     births = Births(first, second, new.uid.index_select(0, daughters), state, rows)
     colony_id = state.colony_id.index_select(0, state.colony.index_select(0, rows))
     note = Ended(colony_id, state.uid.index_select(0, rows), "divided")
-    new = new.replace(births=(*new.births, births), ended=(*new.ended, note))
+    at = new.position if new.space is None else new.space.inside(new.position)
+    new = new.replace(births=(*new.births, births), ended=(*new.ended, note), position=at)
     if by_kernels and fresh is not None:
         return new
     return new.reset_at_division(daughters, new.declared)

@@ -22,7 +22,7 @@ from torchfilm.physics.adhesion import Adhesion, check_walls_of
 from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.initial_overlaps import check_apart, check_fits, check_room
 from torchfilm.physics.one_sided_records import OneSidedSettings
-from torchfilm.physics.space import PeriodicSpace, check_inside, check_walls_in
+from torchfilm.physics.space import PeriodicSpace, check_first_cells, check_walls_in
 from torchfilm.physics.surfaces import Surface
 from torchfilm.physics.walls import Wall
 from torchfilm.resolver import Values
@@ -165,7 +165,7 @@ class Mechanics(Effect):
         return [s for wall in self.walls for s in wall.surfaces(self.dim)]
 
     @property
-    def space(self) -> PeriodicSpace | None:
+    def periodic_space(self) -> PeriodicSpace | None:
         return PeriodicSpace.of("Mechanics.periodic", self.periodic, self.dim)
 
     @property
@@ -191,7 +191,7 @@ class Mechanics(Effect):
                 OVERLAP if self.contact_overlap is None else self.contact_overlap,
                 FORCE_TOLERANCE if self.tolerance is None else self.tolerance,
                 self.max_iterations,
-                self.space,
+                self.periodic_space,
             )
         return ContactSettings.resolve(
             self.dim,
@@ -256,8 +256,10 @@ class Mechanics(Effect):
     def check(self, state: State, values: Values) -> None:
         if state.dim != self.dim:
             raise checks.input_error("Mechanics.dim", self.dim, f"{state.dim}, like the cells")
-        if self.space is not None:
-            check_inside(self.space, state.position, state.own_colony_id, state.uid)
+        if (space := self.periodic_space) is not None:
+            check_first_cells(
+                space, state.position, state.length, state.radius, state.own_colony_id, state.uid
+            )
         for kind in self.adhesion:
             check_variables("Adhesion", state, adhesin=kind.adhesin, partner=kind.partner)
         for surface in self.surfaces():
@@ -285,7 +287,7 @@ class Mechanics(Effect):
             state.colony,
             state.colony_id,
             state.uid,
-            self.space,
+            space,
         )
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:

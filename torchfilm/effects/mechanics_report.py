@@ -72,8 +72,9 @@ class MechanicsReport(ContactReport):
             return "the length of a cell is below 0"
         if status == TOO_LONG:
             return (
-                "a cell is longer than half of the way between the faces of its periodic space, so"
-                " that it could meet two images of another cell"
+                "a cell, with its caps and what its contacts and bonds reach, is longer than half"
+                " of the way between the faces of its periodic space, so that it could meet two"
+                " images of another cell"
             )
         if status == TOO_STICKY:
             return (

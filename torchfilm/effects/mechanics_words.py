@@ -30,8 +30,8 @@ def numerics_in_words(effect: Mechanics, dt: float, device: torch.device) -> lis
     if effect.walls:
         hard = len(effect.walls) - len(soft)
         lines.append(f"walls: {hard} hard, {len(soft)} with a stiffness or weight")
-    if effect.space is not None:
-        lines.append(f"periodic: {effect.space.told}")
+    if effect.periodic_space is not None:
+        lines.append(f"periodic: {effect.periodic_space.told}")
     return lines
 
 

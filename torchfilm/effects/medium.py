@@ -165,10 +165,10 @@ class Medium(Effect):
 
     def check_scene(self, effects: Sequence[Effect], founders: Any) -> None:
         """Raise InputError where cells live in a periodic space and signals do not."""
-        faces = [e.space.faces for e in effects if e.space is not None]
-        if faces:
+        spaces = [e.periodic_space for e in effects if e.periodic_space is not None]
+        if spaces:
             periodic = self.boundary_of(next(iter(self.signals))).periodic
-            check_same_faces(faces[0], periodic, self.box)
+            check_same_faces(spaces[0].faces, periodic, self.box)
 
     def boundary_of(self, name: str) -> BoundaryConditions:
         """The boundary conditions of a signal."""

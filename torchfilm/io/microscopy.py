@@ -31,7 +31,8 @@ Window = tuple[tuple[float, float], tuple[float, float]]
 @dataclass(frozen=True, eq=False)
 class View:
     """What is imaged: one colony of a run, some frames, a raster, and, in space, the height of the
-    section, µm, or None for the projection along z."""
+    section, µm, or None for the projection along z. faces: of a periodic space, (low, high) µm by
+    axis, beyond which images of cells are seen; none where they are not."""
 
     results: Results
     colony: int
@@ -39,6 +40,7 @@ class View:
     raster: Raster
     z: float | None
     tables: Tables
+    faces: Mapping[str, tuple[float, float]]
 
     def cells(self, k: int) -> tuple[dict[str, np.ndarray], Rods]:
         """The columns of the colony's cells in a frame, and their shapes."""
@@ -50,6 +52,17 @@ class View:
         length, radius = (columns[n].astype(np.float64) for n in ("length", "radius"))
         return columns, Rods(centre, axis, length / 2, radius)
 
+    def seen(self, rods: Rods, raster: Raster) -> tuple[Rods, np.ndarray]:
+        """The cells, and those images of them that reach into the raster; and which cell each
+        is."""
+        which = np.arange(len(rods.half))
+        for k, axis in enumerate("xy"):
+            if axis in self.faces:
+                low, high = self.faces[axis]
+                rods, more = rods.repeated(k, high - low, raster.span[k])
+                which = which[more]
+        return rods, which
+
 
 def view_of(
     results: Results,
@@ -59,8 +72,10 @@ def view_of(
     window: Window | None,
     z: float | None,
     section: bool,
+    images: bool = True,
 ) -> View:
-    """The view that is asked for. section: in space a height `z` is needed."""
+    """The view that is asked for. section: in space a height `z` is needed. images: of cells beyond
+    the faces of a periodic space are seen."""
     pixel = checks.number("pixel_size", pixel_size, above=0.0, hint="In µm.")
     chosen = check_frames(len(results), frames, results.path)
     lineage = results.lineage()
@@ -73,7 +88,8 @@ def view_of(
     elif space and section:
         raise checks.input_error("z", None, "the height of the section, µm: this run is in space")
     tables = Tables(results, lineage, internals=True)
-    empty = View(results, own, chosen, Raster(pixel, 0.0, 0.0, (0, 0)), z, tables)
+    faces = results.periodic if images else {}
+    empty = View(results, own, chosen, Raster(pixel, 0.0, 0.0, (0, 0)), z, tables, faces)
     (left, bottom), (right, top) = _corners(empty) if window is None else _checked(window)
     if z is not None:
         _check_height(empty, z)
@@ -84,7 +100,7 @@ def view_of(
         )
         raise checks.input_error("pixel_size", pixel, rule, "Or give a smaller window.")
     shape = max(1, round(rows)), max(1, round(columns))
-    return View(results, own, chosen, Raster(pixel, left, top, shape), z, tables)
+    return View(results, own, chosen, Raster(pixel, left, top, shape), z, tables, faces)
 
 
 def _check_height(view: View, z: float) -> None:
@@ -112,7 +128,8 @@ def _checked(window: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 def _corners(view: View) -> tuple[list[float], list[float]]:
-    """The box, µm, around the colony in all frames, with a margin."""
+    """The box, µm, around the colony in all frames, with a margin; from face to face where space is
+    periodic."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for k in view.frames:
         rods = view.cells(k)[1]
@@ -124,7 +141,11 @@ def _corners(view: View) -> tuple[list[float], list[float]]:
             f"colony {view.colony} has no cell in these frames of {view.results.path}: give the"
             " window, µm, of the empty images."
         )
-    return (low - MARGIN).tolist(), (high + MARGIN).tolist()
+    low, high = low - MARGIN, high + MARGIN
+    for axis, faces in view.faces.items():
+        if axis in "xy":
+            low["xy".index(axis)], high["xy".index(axis)] = faces
+    return low.tolist(), high.tolist()
 
 
 # --- masks ----------------------------------------------------------------------------------------
@@ -143,7 +164,8 @@ def write_labels(view: View, path: str | Path, overwrite: bool) -> Path:
         for k in view.frames:
             columns, rods = view.cells(k)
             labels = (columns["cell"] + 1).astype(dtype)
-            yield label_image(rods, labels, view.raster, 0.0 if view.z is None else view.z)
+            rods, which = view.seen(rods, view.raster)
+            yield label_image(rods, labels[which], view.raster, 0.0 if view.z is None else view.z)
 
     return _write(view, target, pages(), dtype, ["labels"])
 
@@ -241,7 +263,8 @@ def light_images(
         if bad.any():
             rule = "a quantity that is known and at least 0 in all cells"
             raise checks.input_error("channels", names[int(bad.argmax())], rule)
-        light = thickness_image(rods, weights, raster, profile == "flat")
+        rods, which = view.seen(rods, raster)
+        light = thickness_image(rods, weights[:, which], raster, profile == "flat")
         for name, image in zip(names, light, strict=True):
             yield camera.image(image, raster.pixel, (view.colony, int(steps[k])), name)
 

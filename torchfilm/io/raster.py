@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -19,6 +20,13 @@ class Raster:
     left: float
     top: float
     shape: tuple[int, int]
+
+    @property
+    def span(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """From where to where it reaches along x and along y, µm."""
+        rows, columns = self.shape
+        right, bottom = self.left + columns * self.pixel, self.top - rows * self.pixel
+        return (self.left, right), (bottom, self.top)
 
     def wider(self, margin: int) -> Raster:
         """With a margin of pixels on all sides."""
@@ -40,6 +48,23 @@ class Rods:
     def reach(self) -> np.ndarray:
         """(N, 2) how far each cell reaches from its centre along x and y, µm."""
         return np.abs(self.axis[:, :2]) * self.half[:, None] + self.radius[:, None]
+
+    def repeated(self, k: int, period: float, span: tuple[float, float]) -> tuple[Rods, np.ndarray]:
+        """The cells, and their images every `period` µm along axis k that reach into a span; and
+        which cell each is."""
+        x, reach = self.centre[:, k], self.reach[:, k]
+        parts, moves = [np.arange(len(x))], [np.zeros(len(x))]
+        if len(x):
+            first = math.floor((span[0] - x.max() - reach.max()) / period)
+            last = math.ceil((span[1] - x.min() + reach.max()) / period)
+            for turn in (t for t in range(first, last + 1) if t):
+                at = x + turn * period
+                (seen,) = np.nonzero((at + reach > span[0]) & (at - reach < span[1]))
+                parts.append(seen)
+                moves.append(np.full(len(seen), turn * period))
+        which, centre = np.concatenate(parts), self.centre[np.concatenate(parts)]
+        centre[:, k] += np.concatenate(moves)
+        return Rods(centre, self.axis[which], self.half[which], self.radius[which]), which
 
 
 def label_image(rods: Rods, labels: np.ndarray, raster: Raster, z: float) -> np.ndarray:

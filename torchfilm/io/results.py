@@ -415,7 +415,7 @@ class Results(metaclass=checks.KnownKeywords):
         from torchfilm.io.microscopy import Camera, view_of
 
         camera = Camera(blur, background, offset, noise, seed)
-        view = view_of(self, pixel_size, colony, frames, window, z, section=True)
+        view = view_of(self, pixel_size, colony, frames, window, z, section=True, images=False)
         return write_ctc(view, path, channels, profile, camera, overwrite)
 
     @partial(checks.known_keywords, instead=BY_NUMBER)

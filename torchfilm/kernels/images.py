@@ -33,7 +33,7 @@ def is_periodic(periods):
 def with_images(memory, x, axis, half, radius, periods, margin, dof):
     """The cells in a period about the first one, and those images above it that a cell in it may
     come nearer than margin: positions (m, d), which cell each is, and a bit for each axis along
-    which it is moved by a period, (m,). The cells come first."""
+    which it is moved by a period, (m,). The cells come first, as in the batch."""
     n, d = x.shape[0], 2 if len(dof) == 4 else 3
     base, side = room(memory, (n, d), np.float64), room(memory, (n, d), np.float64)
     most, many = room(memory, (d,), np.float64), 1
@@ -86,14 +86,21 @@ def axes_of_images(memory, axis, cell, dof):
 
 
 @lean
-def pairs_of_cells(first, second, cell, way):
-    """The pairs of cells whose images are these pairs, in place, each once and the lower one first:
-    of the pairs that differ by the same moves, that in which no two are moved along the same
-    axis."""
+def pairs_of_cells(first, second, y, cell, way, periods, dof):
+    """The pairs of cells whose nearest images are these pairs, in place, each once and the lower
+    cell first: of the pairs that differ by the same moves, that in which no two are moved along the
+    same axis."""
     new = 0
     for r in range(first.shape[0]):
         p, q = first[r], second[r]
+        if cell[p] > cell[q]:
+            p, q = q, p
         i, j = cell[p], cell[q]
-        first[new], second[new] = min(i, j), max(i, j)
-        new += (way[p] & way[q]) == 0 and i != j
+        keep = (way[p] & way[q]) == 0 and i != j
+        for k in range(2 if len(dof) == 4 else 3):
+            if periods[k] > 0.0:  # of the cells themselves, so that one of two images counts
+                wanted = -math.floor((y[j, k] - y[i, k]) / periods[k] + 0.5)
+                keep &= (way[q] >> k & 1) - (way[p] >> k & 1) == wanted
+        first[new], second[new] = i, j
+        new += keep
     return first[:new], second[:new]

@@ -122,7 +122,7 @@ def near_pairs_of(memory, x, axis, half, radius, periods, margin, some, dof):
         memory, y, axes_of_images(memory, axis, cell, dof), of_images(memory, half, cell),
         of_images(memory, radius, cell), margin, marks, dof,
     )  # fmt: skip
-    first, second = pairs_of_cells(first, second, cell, way)
+    first, second = pairs_of_cells(first, second, y, cell, way, periods, dof)
     return _by_first(memory, first, second, x.shape[0])
 
 

@@ -8,7 +8,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
+from torchfilm.physics.space import Faces
 from torchfilm.physics.walls import Wall, depth_in_walls
 from torchfilm.tools import checks
 
@@ -19,14 +21,14 @@ if TYPE_CHECKING:
 STEPS, STEP = 200, 0.025  # how many steps at most; h, as long as a step of growth
 
 
-def relax(cells: Cells, depth: float, walls: Sequence[Wall]) -> Cells:
+def relax(cells: Cells, depth: float, walls: Sequence[Wall], periodic: Faces | None) -> Cells:
     """`Cells.relaxed` documents it. A scene without growth has contacts only, which push."""
     from torchfilm.effects.mechanics import Mechanics
     from torchfilm.scene import Scene
 
     checks.number("depth", depth, above=0.0, hint="µm.")
     # a soft wall would push for ever less
-    mechanics = Mechanics(dim=cells.dim, walls=walls)
+    mechanics = Mechanics(dim=cells.dim, walls=walls, periodic={} if periodic is None else periodic)
     hard = [replace(w, stiffness=None, weight=None) for w in mechanics.walls]
     plain = replace(cells, cell_type=None, extra={}, micrograph=None)
     with warnings.catch_warnings():
@@ -37,7 +39,7 @@ def relax(cells: Cells, depth: float, walls: Sequence[Wall]) -> Cells:
     of = np.arange(cells.count) if cells.colony is None else np.argsort(cells.colony, kind="stable")
     now = cells
     for _ in range(STEPS + 1):
-        found, deepest = now.overlaps(depth), _deepest(state, hard)
+        found, deepest = now.overlaps(depth, periodic=periodic), _deepest(state, hard)
         if not found and deepest <= depth:
             break
         state = model.step(state, STEP)
@@ -55,7 +57,10 @@ def relax(cells: Cells, depth: float, walls: Sequence[Wall]) -> Cells:
         )
     if cells.micrograph is None or now is cells:
         return now
-    moved = np.sqrt(((now.position - cells.position) ** 2).sum(1))
+    way = torch.from_numpy(now.position - cells.position).T
+    if mechanics.periodic_space is not None:
+        way = way + mechanics.periodic_space.shift(way)
+    moved = way.norm(dim=0).numpy()
     return replace(now, micrograph=replace(cells.micrograph, moved=moved))
 
 

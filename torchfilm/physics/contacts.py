@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.kernels.bilateral_scheme import CANDIDATE, NEAR
-from torchfilm.physics.space import PeriodicSpace, check_reach, near_pairs
+from torchfilm.physics.space import PeriodicSpace
 from torchfilm.physics.stretches import stretch_of
 from torchfilm.tools.reads import rows_where
 from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_sqrt
@@ -366,35 +366,6 @@ def contact_gaps(capsules: Capsules, first: Tensor, second: Tensor) -> Tensor:
     """Signed gap of each pair at its closest points, (P,) µm; negative where they overlap."""
     a, b = capsules.pairs(first, second)
     return gap_at(a, b, *closest_points(a, b))
-
-
-@torch.no_grad()
-def gaps_nearby(
-    position: Tensor,
-    axis: Tensor,
-    length: Tensor,
-    radius: Tensor,
-    colony: Tensor,
-    colonies: int,
-    within: float = 0.0,
-    space: PeriodicSpace | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs of one colony that may be within `within` µm, and their gaps, in float64.
-
-    position, axis: (N, d). length, radius: (N,). colony: (N,) int64. space: as of `Capsules`.
-    Returns first, second and gap, each (P,).
-    """
-    position, axis, length, radius = (
-        position.double(),
-        axis.double(),
-        length.double(),
-        radius.double(),
-    )
-    if space is not None:
-        check_reach(space, length, radius, within)
-    first, second = near_pairs(position, axis, length, radius, colony, colonies, within, space)
-    capsules = Capsules(position.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius, space)
-    return first, second, contact_gaps(capsules, first, second)
 
 
 def rows_at(a: Capsules, b: Capsules, s: Tensor, t: Tensor, end_a: Tensor, end_b: Tensor):

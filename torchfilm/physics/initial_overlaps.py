@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.physics.nearby import gaps_nearby
 from torchfilm.physics.space import PeriodicSpace
 from torchfilm.physics.surfaces import FlatSurface, RoundSurface, Surface, per_cell
 from torchfilm.tools.warn_once import warn
@@ -38,6 +38,8 @@ def check_apart(
         return
     i, j, gap = gaps_nearby(position, axis, length, radius, colony, len(colony_id), space=space)
     between = (position.index_select(0, i) - position.index_select(0, j)).double()
+    if space is not None:
+        between = between + space.shift(between.T).T
     least = torch.minimum(radius.index_select(0, i), radius.index_select(0, j)).double()
 
     def name(pair: Tensor) -> str:
@@ -59,10 +61,11 @@ def check_apart(
         )
     else:
         worst = deep[torch.argmin(gap[deep])]
+        remedy = "Cells.relaxed()" if space is None else "Cells.relaxed(periodic=…)"
         found = (
             f"{name(worst)} start {-float(gap[worst]):.3g} µm deep in one another (pairs that"
             f" overlap by over a radius: {deep.numel()}). The first steps may push them through one"
-            " another. Push the cells apart by Cells.relaxed(); or check the unit of the table"
+            f" another. Push the cells apart by {remedy}; or check the unit of the table"
             " (µm) and its lengths (of the centreline, without caps)."
         )
     warn(found, category=RuntimeWarning)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -17,45 +18,57 @@ from torchfilm.tools.ragged import Groups
 from torchfilm.tools.reads import rows_where
 
 AXES = "xyz"
+Faces = Mapping[str, tuple[float, float]]  # (low, high) µm by axis
 # By how much the reach of cells is enlarged, so that rounding loses no pair that touches exactly.
 ENLARGED = 1e-5
 
 
 @dataclass(frozen=True)
 class PeriodicSpace:
-    """Where cells are in d dimensions: low (d,) the lower face of each axis, µm, and period (d,)
-    the distance to the upper one, µm; 0 along an axis that is not periodic.
+    """Where cells are in d dimensions: low and high (d,) the faces of each axis, µm; alike along an
+    axis that is not periodic.
 
     A contact is that of the nearest images of its cells. No other images meet as long as no cell,
     with what it reaches, is longer than half a period: see `too_long`.
     """
 
     low: tuple[float, ...]
-    period: tuple[float, ...]
+    high: tuple[float, ...]
 
     @staticmethod
     def of(name: str, given: Any, dim: int) -> PeriodicSpace | None:
         """From {"x": (low, high), …}; None of no axis. Raises InputError, which names `name`."""
-        rule = 'a dict of axes and their faces in µm, such as {"x": (0, 40)}'
+        if given is None:
+            return None
         if not isinstance(given, Mapping):
+            rule = 'a dict of axes and their faces in µm, such as {"x": (0, 40)}'
             raise checks.input_error(name, given, rule)
-        axes, low, period = AXES[:dim], [0.0] * dim, [0.0] * dim
+        axes, low, high = AXES[:dim], [0.0] * dim, [0.0] * dim
         for axis, faces in given.items():
             if axis not in tuple(axes):
                 raise checks.input_error(f"{name}, axis", axis, " or ".join(map(repr, axes)))
-            if not isinstance(faces, (tuple, list)) or len(faces) != 2:
-                raise checks.input_error(f"{name}[{axis!r}]", faces, "(low, high) in µm")
+            if (
+                isinstance(faces, (str, Mapping))
+                or not hasattr(faces, "__len__")
+                or len(faces) != 2
+            ):
+                rule = "(low, high) in µm, the same for all colonies"
+                raise checks.input_error(f"{name}[{axis!r}]", faces, rule)
             k = axes.index(axis)
             low[k] = checks.number(f"{name}[{axis!r}], low", faces[0])
-            high = checks.number(f"{name}[{axis!r}], high", faces[1], above=low[k])
-            period[k] = high - low[k]
-        return PeriodicSpace(tuple(low), tuple(period)) if given else None
+            high[k] = checks.number(f"{name}[{axis!r}], high", faces[1], above=low[k])
+        return PeriodicSpace(tuple(low), tuple(high)) if given else None
 
-    @property
+    @cached_property
+    def period(self) -> tuple[float, ...]:
+        """The distance of the faces of each axis, µm; 0 along one that is not periodic."""
+        return tuple(high - low for low, high in zip(self.low, self.high, strict=True))
+
+    @cached_property
     def faces(self) -> dict[str, tuple[float, float]]:
         """The faces of each periodic axis, µm, as they are given."""
-        each = zip(AXES, self.low, self.period, strict=False)
-        return {axis: (low, low + period) for axis, low, period in each if period}
+        each = zip(AXES, self.low, self.high, strict=False)
+        return {axis: (low, high) for axis, low, high in each if high > low}
 
     @property
     def told(self) -> str:
@@ -70,29 +83,30 @@ class PeriodicSpace:
         return min(period for period in self.period if period)
 
     def too_long(self, length: Tensor, radius: Tensor, reach: float | Tensor) -> Tensor:
-        """Which cells, whose caps count, could meet two images of a cell that is nearer than
-        `reach`, µm, (N,) bool."""
+        """Which cells, with their caps, could meet two images of another one as long, if those meet
+        that are nearer than `reach`, µm, (N,) bool."""
         return length + 2 * radius + reach > 0.5 * self.shortest
 
     def inside(self, position: Tensor) -> Tensor:
         """The image of each position between the faces, (N, d) float64; the bits of one that lies
         there stay as they are."""
         columns = list(position.unbind(1))
-        for k, (low, period) in enumerate(zip(self.low, self.period, strict=True)):
+        for k, (low, high, period) in enumerate(zip(self.low, self.high, self.period, strict=True)):
             if period:
                 x = columns[k]
-                away = torch.floor((x.detach() - low) / period)
-                moved = x - period * away
-                moved = torch.where(moved.detach() < low + period, moved, low + 0.0 * moved)
-                columns[k] = torch.where(away == 0, x, moved)
+                moved = x - period * torch.floor((x.detach() - low) / period)
+                at = moved.detach()  # may be rounded over a face
+                at_low = low + (moved - at)
+                moved = torch.where((at < low) | (at >= high), at_low, moved)
+                columns[k] = torch.where((x >= low) & (x < high), x, moved)
         return torch.stack(columns, 1)
 
     def outside(self, position: Tensor) -> Tensor:
         """Which positions lie beyond a face, (N,) bool."""
         found = torch.zeros_like(position[:, 0], dtype=torch.bool)
-        for k, (low, period) in enumerate(zip(self.low, self.period, strict=True)):
-            if period:
-                found = found | ((position[:, k] < low) | (position[:, k] > low + period))
+        for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
+            if high > low:
+                found = found | ((position[:, k] < low) | (position[:, k] > high))
         return found
 
     @torch.no_grad()
@@ -102,19 +116,19 @@ class PeriodicSpace:
         moves = torch.zeros_like(between)
         for k, period in enumerate(self.period):
             if period:
-                moves[k] = -period * torch.round(between[k] / period)
+                moves[k] = -period * torch.floor(between[k] / period + 0.5)
         return moves
 
-    def images(self, position: Tensor, side: Tensor, groups: Groups) -> _Images:
+    @torch.no_grad()
+    def images(self, position: Tensor, side: Tensor, groups: Groups) -> Images:
         """The cells in a period about the first of their colony, and those images above it that a
         cell in it may meet. side: (N, d) how far each cell reaches along each axis, µm."""
         periods = torch.tensor(self.period, dtype=position.dtype, device=position.device)
         first = groups.begin[:-1].clamp(max=position.shape[0] - 1).index_select(0, groups.owner)
         away = position - position.index_select(0, first)
-        turns = torch.round(away / torch.where(periods > 0, periods, 1.0))
+        turns = torch.floor(away / torch.where(periods > 0, periods, 1.0) + 0.5)
         base, away = (x - periods * turns for x in (position, away))
         most = torch.stack([groups.max(x) for x in side.unbind(1)], 1).index_select(0, groups.owner)
-        # slightly larger, so that rounding loses no pair that touches exactly
         meets = away + 0.5 * periods <= (side + most) * (1 + ENLARGED)
         every = [(False, True) if period else (False,) for period in self.period]
         ways = torch.tensor(list(itertools.product(*every)), device=position.device)
@@ -126,20 +140,86 @@ class PeriodicSpace:
         # of a colony side by side, first its cells, then images
         order = torch.argsort(groups.owner.index_select(0, cell), stable=True)
         cell, way = cell.index_select(0, order), way.index_select(0, order)
-        return _Images(base.index_select(0, cell) + periods * way, cell, way)
+        return Images(base.index_select(0, cell) + periods * way, cell, way, base, self)
+
+
+@dataclass(frozen=True)
+class Images:
+    """Cells and images of cells: positions (M, d), which cell each is, (M,), and along which axes
+    it is moved by a period, (M, d) bool, from the cells' `base` (N, d)."""
+
+    position: Tensor
+    cell: Tensor
+    way: Tensor
+    base: Tensor
+    space: PeriodicSpace
+
+    def cells_of(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+        """The cells of pairs of images, (P,) each."""
+        return self.cell.index_select(0, first), self.cell.index_select(0, second)
+
+    def distinct(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the pairs of images (P,), each once: of those that differ by the same moves, that in
+        which no two are moved along the same axis; and no cell with itself."""
+        both = self.way.index_select(0, first) & self.way.index_select(0, second)
+        i, j = self.cells_of(first, second)
+        (once,) = rows_where(~both.any(1) & (i != j))
+        return first.index_select(0, once), second.index_select(0, once)
+
+    def nearest_pairs(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+        """The pairs of cells, each once, of which these pairs are the nearest images."""
+        first, second = self.distinct(first, second)
+        i, j = self.cells_of(first, second)
+        # the way from the lower to the higher cell decides, in whichever order they were found
+        low, high = torch.minimum(i, j), torch.maximum(i, j)
+        between = self.base.index_select(0, high) - self.base.index_select(0, low)
+        moved = self.way.index_select(0, second).long() - self.way.index_select(0, first).long()
+        moved = torch.where((i < j).unsqueeze(1), moved, -moved)
+        nearest = torch.ones_like(i, dtype=torch.bool)
+        for k, period in enumerate(self.space.period):
+            if period:
+                wanted = -torch.floor(between[:, k] / period + 0.5)
+                nearest &= moved[:, k] == wanted
+        (keep,) = rows_where(nearest)
+        return i.index_select(0, keep), j.index_select(0, keep)
+
+
+@torch.no_grad()
+def near_images(
+    space: PeriodicSpace, position: Tensor, axis: Tensor, length: Tensor, radius: Tensor,
+    colony: Tensor, colonies: int, margin: float | Tensor,
+) -> tuple[Images, Tensor, Tensor]:  # fmt: skip
+    """The images of cells, and the pairs of `Neighbourhood` among them."""
+    side = 0.5 * length.unsqueeze(1) * axis.abs() + (radius + 0.5 * margin).unsqueeze(1)
+    found = space.images(position, side, Groups(colony, colonies))
+    pick = lambda x: x.index_select(0, found.cell)
+    near = Neighbourhood(
+        found.position, pick(axis), pick(length), pick(radius), pick(colony), colonies,
+        pick(margin) if isinstance(margin, Tensor) else margin,
+    )  # fmt: skip
+    return found, *near.pairs()
+
+
+@torch.no_grad()
+def near_pairs(
+    position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony: Tensor, colonies: int,
+    margin: float | Tensor = 0.0, space: PeriodicSpace | None = None,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """The pairs of `Neighbourhood`; in a periodic space those whose nearest images are near."""
+    cells = position, axis, length, radius, colony, colonies, margin
+    if space is None or not colony.numel():
+        return Neighbourhood(*cells).pairs()
+    images, first, second = near_images(space, *cells)
+    return images.nearest_pairs(first, second)
 
 
 def check_walls_in(space: PeriodicSpace, surfaces: Sequence[Surface]) -> None:
     """Raise InputError for a wall that is not the same at opposite faces."""
     for surface in surfaces:
-        wall = type(surface.wall).__name__
-        across = list(space.faces)
+        wall, across = type(surface.wall).__name__, list(space.faces)
         if isinstance(surface, FlatSurface):
-            across = [
-                a
-                for a in across
-                if bool((torch.as_tensor(surface.normal[AXES.index(a)]) != 0).any())
-            ]
+            normal = [torch.as_tensor(x).detach() for x in surface.normal]
+            across = [a for a in across if bool((normal[AXES.index(a)].abs() > 1e-12).any())]
         if across:
             raise checks.InputError(
                 f"Mechanics.periodic: the {wall} ends space along {' and '.join(across)}, which is"
@@ -148,64 +228,25 @@ def check_walls_in(space: PeriodicSpace, surfaces: Sequence[Surface]) -> None:
             )
 
 
-def check_reach(space: PeriodicSpace, length: Tensor, radius: Tensor, reach: float) -> None:
-    """Raise InputError where cells, (N,), are so long, or look so far, µm, that a pair would have
-    two images."""
-    if bool(space.too_long(length, radius, reach).any()):
-        longest = float((length + 2 * radius).max())
-        raise checks.InputError(
-            f"Mechanics.periodic: neighbours up to {reach:g} µm away of cells up to {longest:.3g}"
-            f" µm long are wanted, and half of the way between the faces is"
-            f" {0.5 * space.shortest:g} µm: cells would meet two images of others. Place the faces"
-            " farther apart, or take shorter cells or distances."
-        )
-
-
-def check_inside(space: PeriodicSpace, position: Tensor, ids: Tensor, uid: Tensor) -> None:
-    """Raise InputError for a cell that starts beyond a face. ids: (N,) of the cells' colonies."""
+def check_first_cells(
+    space: PeriodicSpace, position: Tensor, length: Tensor, radius: Tensor, ids: Tensor, uid: Tensor
+) -> None:
+    """Raise InputError for a cell that starts beyond a face, or is too long. position (N, d);
+    length, radius (N,) µm; ids, uid: (N,) of the cells' colonies, and of the cells."""
+    name = lambda k: f"cell {int(uid[k])} of colony {int(ids[k])}"
     beyond = torch.nonzero(space.outside(position)).squeeze(1)
     if beyond.numel():
         k = int(beyond[0])
         at = [round(x, 3) for x in position[k].tolist()]
         raise checks.InputError(
-            f"Mechanics.periodic: cell {int(uid[k])} of colony {int(ids[k])} starts at {at}, beyond"
-            f" the faces ({space.told}; cells beyond them: {beyond.numel()}). Move the cell, or the"
-            " faces."
+            f"Mechanics.periodic: {name(k)} starts at {at}, beyond the faces ({space.told}; cells"
+            f" beyond them: {beyond.numel()}). Move the cell, or the faces."
         )
-
-
-@dataclass(frozen=True)
-class _Images:
-    """Cells and images of cells: positions (M, d), which cell each is, (M,), and along which axes
-    it is moved by a period, (M, d) bool."""
-
-    position: Tensor
-    cell: Tensor
-    way: Tensor
-
-    def pairs_of_cells(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-        """The pairs of cells whose images are these pairs, each once: of the pairs that differ by
-        the same moves, that in which no two are moved along the same axis."""
-        both = self.way.index_select(0, first) & self.way.index_select(0, second)
-        i, j = self.cell.index_select(0, first), self.cell.index_select(0, second)
-        (once,) = rows_where(~both.any(1) & (i != j))
-        return i.index_select(0, once), j.index_select(0, once)
-
-
-@torch.no_grad()
-def near_pairs(
-    position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony: Tensor, colonies: int,
-    margin: float | Tensor = 0.0, space: PeriodicSpace | None = None,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """The pairs of `Neighbourhood`, also those across the faces of a periodic space."""
-    if space is None or not colony.numel():
-        return Neighbourhood(position, axis, length, radius, colony, colonies, margin).pairs()
-    reach = (radius + 0.5 * margin).unsqueeze(1)
-    side = 0.5 * length.unsqueeze(1) * axis.abs() + reach
-    found = space.images(position, side, Groups(colony, colonies))
-    pick = lambda x: x.index_select(0, found.cell)
-    near = Neighbourhood(
-        found.position, pick(axis), pick(length), pick(radius), pick(colony), colonies,
-        pick(margin) if isinstance(margin, Tensor) else margin,
-    )  # fmt: skip
-    return found.pairs_of_cells(*near.pairs())
+    long = torch.nonzero(space.too_long(length, radius, 0.0)).squeeze(1)
+    if long.numel():
+        k = int(long[0])
+        raise checks.InputError(
+            f"Mechanics.periodic: {name(k)} is {float(length[k] + 2 * radius[k]):.3g} µm long with"
+            f" its caps, more than half of the way between the faces ({space.told}): it could meet"
+            " two images of another cell. Place the faces farther apart."
+        )

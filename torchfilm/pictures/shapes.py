@@ -62,8 +62,9 @@ def with_images(
         x = cells["position"][:, k]
         reach = 0.5 * cells["length"] * np.abs(cells["axis"][:, k]) + cells["radius"]
         left, right = min(left, right), max(left, right)
-        parts = [cells]
-        for shift in (low - high, high - low):
+        parts, period = [cells], high - low
+        turns = range(math.floor((left - high) / period), math.ceil((right - low) / period) + 1)
+        for shift in (turn * period for turn in turns if turn):
             seen = (x + shift + reach > left) & (x + shift - reach < right)
             image = {name: value[seen] for name, value in cells.items()}
             move = np.eye(cells["position"].shape[1])[k] * shift

@@ -57,41 +57,49 @@ def nutrient_limited(
     )
 
 
-# µm: how far below the top of the medium cells are carried away, and the least space between the
-# first cells.
-BELOW, APART = 4.0, 5.0
+# µm: how far below the top of the medium cells are carried away, the least space between the first
+# cells, and the least width: cells grow up to 5.5 µm long, with their caps, and must be shorter
+# than half of it.
+BELOW, APART, NARROWEST = 4.0, 5.0, 12.0
 
 
 def biofilm(
     supply: float | Tensor = 1.0,
     half: float | Tensor = 0.1,
-    diffusion: float | Tensor = 100.0,
-    growth_yield: float | Tensor = 0.2,
+    diffusion: float | Tensor = 1e4,
+    growth_yield: float | Tensor = 2e-3,
     rate: float | Tensor = 1.0,
     width: float = 60.0,
     height: float = 60.0,
     first: int = 6,
-    layer: float | None = None,
+    layer: float | None = 10.0,
     spacing: float = 2.0,
     length_drag: float = 1e5,
 ) -> Scene:
     """A slice of a biofilm on a floor, y = 0, fed from above: periodic along x, so that no edge
     shapes it (after Picioreanu et al. 1998 and Lardon et al. 2011).
 
-    The nutrient is kept at `supply` at the height of `height` µm, or, with a `layer`, so many µm
-    above the centre of the highest cell, to a voxel: what mixes above is the bulk. Cells grow by
+    The nutrient is kept at `supply` at the distance `layer`, µm, above the centre of the highest
+    cell, to a voxel: beyond, all is mixed. With layer=None it is kept so at `height`. Cells grow by
     `rate` (1/h) · s/(half + s), down to a depth of about √(2 · diffusion · s · growth_yield /
     rate), with the s at the surface. Where that is many cells the film is flat; where it is one or
     two, bumps shade what lies lower and become fingers. Cells whose centre comes within 4 µm of
     `height` are carried away.
 
+    Only the product of diffusion, supply and yield matters, while the nutrient that is there at
+    first is little: it feeds a film of supply · growth_yield · its own height.
+
     width: µm. first: how many cells lie on the floor at the start, in each colony at places of its
     own, 5 µm apart or more. growth_yield: µm³ of cell from one unit of concentration × µm³. The
     slice is 1 µm deep, like the cells.
     """
-    width = checks.number("biofilm(width)", width, above=0.0)
+    width = checks.number("biofilm(width)", width, least=NARROWEST)
     height = checks.number("biofilm(height)", height, above=2 * BELOW)
     spacing = checks.number("biofilm(spacing)", spacing, above=0.0)
+    for name, size in (("width", width), ("height", height)):
+        if abs(size / spacing - round(size / spacing)) > 1e-6:
+            rule = f"a whole number of voxels of {spacing:g} µm (spacing)"
+            raise checks.input_error(f"biofilm({name})", size, rule)
     first = checks.integer("biofilm(first)", first, least=1)
     top = height
     if layer is not None:
