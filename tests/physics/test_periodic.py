@@ -123,20 +123,75 @@ def test_pairs_of_a_colony_do_not_depend_on_the_batch():
 
 @pytest.mark.parametrize("dim, axes", AXES)
 def test_positions_come_back_inside(dim, axes):
-    """By whole periods, and those inside keep their bits; none lies beyond a face, whatever is
-    rounded."""
+    """By whole periods, and those inside keep their bits."""
     space = space_of(dim, axes)
     x = torch.from_numpy(crowd(1, 500, dim)[0])
-    low, period = torch.tensor(space.low), torch.tensor(space.period)
-    edge = low.expand(3, dim).double() + torch.tensor([[0.0], [-1e-17], [-1e-300]]) * (period > 0)
-    x = torch.cat([x, edge, edge + period])
+    low, high = torch.tensor(space.low), torch.tensor(space.high)
+    period = high - low
     moved = space.inside(x)
     steps = (moved - x) / torch.where(period > 0, period, 1.0)
     assert ((steps - steps.round()).abs() < 1e-12)[:, period > 0].all()
     assert (moved == x)[:, period == 0].all() and not space.outside(moved).any()
-    assert (moved[:, period > 0] < (low + period)[period > 0]).all()
-    within = (x >= low) & (x < low + period)
+    within = (x >= low) & (x < high)
     assert within.sum() > 100 and torch.equal(moved[within], x[within])
+
+
+@pytest.mark.parametrize("faces", [(3.8, 68.0), (-22.8, 26.5), (0.1, 0.7), (0.0, 20.0)])
+def test_no_position_is_rounded_over_a_face(faces):
+    """A few units of rounding about each face, and many periods away; the slope is 1 everywhere."""
+    space = PeriodicSpace.of("periodic", {"x": faces}, 2)
+    assert space.faces == {"x": faces}
+    around = [np.nextafter(x, way) for x in faces for way in (-np.inf, np.inf)]
+    around += [x + k * (faces[1] - faces[0]) for x in (*faces, *around) for k in (-7, -1, 1, 5)]
+    around += [*faces, faces[0] - 1e-17, faces[0] - 1e-300]
+    x = torch.tensor([[x, 0.0] for x in around], dtype=torch.float64, requires_grad=True)
+    moved = space.inside(x)
+    assert (moved[:, 0] >= faces[0]).all() and (moved[:, 0] < faces[1]).all()
+    assert torch.equal(space.inside(moved), moved)
+    moved.sum().backward()
+    assert (x.grad == 1).all()
+
+
+def test_two_cells_half_a_period_apart_are_one_pair():
+    """Rounding decides which image is nearest; both are found, and one counts, also where cells are
+    so large that both images are near."""
+    space = space_of(2, "xy")
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        start = rng.uniform(0, SIDE, 2)
+        away = np.array([0.5 * SIDE, rng.choice([0.0, 0.5 * SIDE])])
+        x = np.stack([start, start + away])
+        cells = x, np.array([[1.0, 0.0]] * 2), np.array([9.5, 9.5]), np.array([0.5, 0.5])
+        first, _ = for_python(neighbours.near_pairs)(
+            no_memory(), *cells[:2], 0.5 * cells[2], cells[3],
+            np.array([*space.period, 0.0]), 0.3, DOF[2],
+        )  # fmt: skip
+        colony = torch.zeros(2, dtype=torch.int64)
+        i, _ = near_pairs(*map(torch.from_numpy, cells), colony, 1, 0.3, space)
+        assert len(first) <= 1 and len(i) <= 1
+        found = gaps_nearby(*map(torch.from_numpy, cells), colony, 1, 0.3, space)
+        assert len(found[0]) <= 1
+
+
+def test_wide_cells_far_away_change_no_pair():
+    """They widen the margin of the colony, within which a long cell has two images near a third."""
+    ends = []
+    for side in (12.0, 24.0):
+        position = [[1.0, 5.0], [6.75, 5.0], *([6.0, 20.0 + 8 * k] for k in range(8))]
+        cells = tf.Cells(
+            position=position, axis=[[1.0, 0.0]] * 10, length=[5.1] * 2 + [0.0] * 8,
+            radius=[0.3] * 2 + [1.4] * 8,
+        )  # fmt: skip
+        glue = tf.Adhesion(3.0, reach=0.1)
+        scene = tf.Scene(
+            tf.Mechanics(
+                dim=2, alpha=0.01, adhesion=[glue], tolerance=1e-6, periodic={"x": (0, side)}
+            )
+        )
+        model = scene.bind(cells=cells, dtype=torch.float64)
+        end = model.step(model.start(), 0.05)
+        ends.append(float(end.position[1, 0] - end.position[0, 0]))
+    assert ends[0] == pytest.approx(ends[1], abs=1e-9)
 
 
 def scene_of(dim: int, side: float, *others: tf.Effect, **options) -> tf.Scene:
@@ -329,11 +384,18 @@ def test_a_cell_too_long_for_its_space_fails_by_name():
             pass
 
 
-def test_neighbours_that_are_too_far_away_are_refused():
-    scene = tf.Scene(tf.Mechanics(dim=2, periodic={"x": (0, 12)}))
-    state = scene.bind().start()
-    with pytest.raises(tf.InputError, match=r"neighbours up to 4 µm away.*two images"):
-        tf.measure.neighbours(state, 4.0)
+def test_of_several_images_the_nearest_is_the_neighbour():
+    """A cell as long as the space is wide meets the other one on both sides: once, by the least
+    gap; and no cell meets itself."""
+    scene = tf.Scene(tf.Growth(), dim=2)
+    cells = tf.Cells(position=[[0.0, 0.0], [5.0, 0.0]], axis=[[1.0, 0.0]] * 2, length=[5.0, 3.0])
+    state = scene.bind(cells=cells, dtype=torch.float64).start()
+    state = state.replace(space=PeriodicSpace.of("periodic", {"x": (0.0, 12.0)}, 2))
+    i, j, gap = gaps_nearby(
+        state.position, state.axis, state.length, state.radius, state.colony, 1, 4.0, state.space
+    )
+    assert (i.tolist(), j.tolist()) == ([0], [1]) and float(gap) == pytest.approx(0.0)
+    assert float(tf.measure.neighbours(state, 4.0)[2]) == pytest.approx(5.0)
 
 
 @pytest.mark.parametrize(
@@ -363,6 +425,8 @@ def test_what_does_not_fit_a_periodic_space_is_refused():
     scene = tf.Scene(tf.Mechanics(dim=2, periodic=faces))
     with pytest.raises(tf.InputError, match=r"cell 0 of colony 0 starts at .* beyond the faces"):
         scene.bind(cells=tf.Cells(position=[[41.0, 0.0]], axis=[[1.0, 0.0]], length=2.0))
+    with pytest.raises(tf.InputError, match=r"cell 0 of colony 0 is 21 µm long .* half of the way"):
+        scene.bind(cells=tf.Cells(position=[[1.0, 0.0]], axis=[[0.0, 1.0]], length=20.0))
 
 
 def medium(x: tuple[float, float], *, periodic: bool) -> tf.Medium:

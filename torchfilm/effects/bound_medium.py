@@ -116,7 +116,9 @@ class FirstHalf(_MediumPart):
         often = self.transport.in_turns
         coupled = self.transport.coupled
         if coupled.keys() >= {*self.effect.signals}:
-            return [f"nothing: {' and '.join(dict.fromkeys(coupled.values()))} move all signals"]
+            movers = list(dict.fromkeys(coupled.values()))
+            verb = "moves" if len(movers) == 1 else "move"
+            return [f"nothing: {' and '.join(movers)} {verb} all signals"]
         whole = len(often | coupled.keys()) < len(self.effect.signals)
         first = dt / 2 / self.effect.steps if often else dt / 2
         hours = f"{first:g} h" + (f" or {dt / 2:g} h" if whole and first < dt / 2 else "")

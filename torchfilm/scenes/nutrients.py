@@ -93,22 +93,11 @@ def biofilm(
     own, 5 µm apart or more. growth_yield: µm³ of cell from one unit of concentration × µm³. The
     slice is 1 µm deep, like the cells.
     """
-    width = checks.number("biofilm(width)", width, least=NARROWEST)
-    height = checks.number("biofilm(height)", height, above=2 * BELOW)
-    spacing = checks.number("biofilm(spacing)", spacing, above=0.0)
-    for name, size in (("width", width), ("height", height)):
-        if abs(size / spacing - round(size / spacing)) > 1e-6:
-            rule = f"a whole number of voxels of {spacing:g} µm (spacing)"
-            raise checks.input_error(f"biofilm({name})", size, rule)
-    first = checks.integer("biofilm(first)", first, least=1)
+    _check_slice(width, height, first, spacing)
     top = height
     if layer is not None:
         layer = checks.number("biofilm(layer)", layer, above=0.0)
         top = spacing * math.ceil((1.0 + layer) / spacing)
-    if first * APART > width:
-        most = int(width / APART)
-        rule = f"at most {most} on a floor {width:g} µm wide"
-        raise checks.input_error("biofilm(first)", first, rule)
     return Scene(
         Monod("nutrient", rate=rate, half=half, growth_yield=growth_yield),
         Growth(),
@@ -133,6 +122,20 @@ def biofilm(
         founders=partial(_on_the_floor, first, width),
         dt=0.05,
     )
+
+
+def _check_slice(width: float, height: float, first: int, spacing: float) -> None:
+    """Raise InputError for a slice into which the voxels or the first cells do not fit."""
+    checks.number("biofilm(width)", width, least=NARROWEST)
+    checks.number("biofilm(height)", height, above=2 * BELOW)
+    checks.number("biofilm(spacing)", spacing, above=0.0)
+    for name, size in (("width", width), ("height", height)):
+        if abs(size / spacing - round(size / spacing)) > 1e-6:
+            rule = f"a whole number of voxels of {spacing:g} µm (spacing)"
+            raise checks.input_error(f"biofilm({name})", size, rule)
+    if checks.integer("biofilm(first)", first, least=1) * APART > width:
+        rule = f"at most {int(width / APART)} on a floor {width:g} µm wide"
+        raise checks.input_error("biofilm(first)", first, rule)
 
 
 def _on_the_floor(count: int, width: float, seed: int) -> Cells:
