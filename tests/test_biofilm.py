@@ -182,6 +182,20 @@ def test_the_bulk_follows_the_surface(layer):
     assert float(nutrient[:, -1].min()) > 0.8 and float(nutrient[:, 0].max()) < 0.2
 
 
+def test_the_command_tells_the_thickness_of_a_film():
+    from torchfilm.cli.report import _size
+
+    scene = tf.scenes.biofilm(width=20.0, first=2)
+    *_, state = tf.simulate(scene, until=3.0)
+    thick, rough = (
+        float(x) for x in (tf.measure.film(state).thickness, tf.measure.film(state).roughness)
+    )
+    assert _size(scene, state) == ("film", f"{thick:.1f} µm thick, roughness {rough:.2f} (mean)")
+    scene = tf.scenes.microcolony()
+    *_, state = tf.simulate(scene, until=1.0)
+    assert _size(scene, state)[0] == "colony radius"
+
+
 def test_what_does_not_make_a_biofilm_is_refused():
     with pytest.raises(
         tf.InputError, match=r"biofilm\(width\) = 41.*a whole number of voxels of 2"

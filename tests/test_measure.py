@@ -135,7 +135,7 @@ def test_neighbours_within_no_such_gap_are_refused(gap):
     [
         "overlaps", "colony_centre", "colony_radius", "depth", "nematic_order", "tilt",
         "neighbours", "wall_forces", "growth_rates", "strains", "heterozygosity",
-        "pressure", "clusters", "alike_neighbours", "film",
+        "pressure", "clusters", "alike_neighbours", "film", "displacement",
     ],
 )  # fmt: skip
 def test_a_measure_of_no_state_is_refused(name):
@@ -143,7 +143,8 @@ def test_a_measure_of_no_state_is_refused(name):
     more = {
         "neighbours": {"gap": 1.0}, "clusters": {"gap": 1.0}, "alike_neighbours": {"gap": 1.0},
         "wall_forces": {"walls": [], "dt": 1.0},
-        "growth_rates": {"earlier": None}, "pressure": {"scene": None},
+        "growth_rates": {"earlier": None}, "displacement": {"earlier": None},
+        "pressure": {"scene": None},
     }.get(name, {})  # fmt: skip
     with pytest.raises(tf.InputError, match=rf"{name}\(state\) = None.*a tf\.State"):
         measure(None, **more)

@@ -89,6 +89,25 @@ def test_cells_glide_through_faces_as_in_open_space():
     assert float((away / 20.0 - torch.round(away / 20.0)).abs().max()) < 1e-10
 
 
+def test_displacements_add_up_across_faces():
+    """The way of a cell that glides through a face, and none of daughters that were not there."""
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Division(length=3.0), tf.Motility(speed=20.0),
+        tf.Mechanics(dim=2, periodic=FACES),
+        founders=tf.Cells(position=[[19.0, 0.0]], axis=[[1.0, 0.0]], length=2.0), dt=0.01,
+    )  # fmt: skip
+    way, earlier = 0.0, None
+    for state in tf.simulate(scene, until=0.3, dtype=torch.float64):
+        if earlier is not None:
+            way += float(tf.measure.displacement(state, earlier)[0, 0])
+        earlier = state
+    assert way == pytest.approx(0.3 * 20.0, rel=1e-6) and float(state.position[0, 0]) < 19.0
+    *_, later = tf.simulate(scene, until=0.6, dtype=torch.float64)
+    assert later.cells == 2 and torch.isnan(tf.measure.displacement(later, state)).all()
+    with pytest.raises(tf.InputError, match=r"displacement\(earlier\) = a state at 0\.6 h"):
+        tf.measure.displacement(later, later)
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """A run of three frames, the first with one cell across the left face."""

@@ -169,18 +169,39 @@ def growth_rates(state: State, earlier: State) -> Tensor:
     """How fast each cell has grown since an earlier state of the same run, (N,) 1/h: the change of
     ln(volume) over time. NaN for cells that were born since. Pressure makes it less than the field
     `growth_rate`, which is the rate without it."""
+    known, before = _known_before("growth_rates", state, earlier)
+    volume = torch.full_like(state.volume.double(), torch.nan)
+    volume[known] = earlier.volume.double()[before]
+    return (state.volume.double() / volume).log() / (state.time - earlier.time)
+
+
+@of_a_state
+@torch.no_grad()
+def displacement(state: State, earlier: State) -> Tensor:
+    """How far each cell's centre has moved since an earlier state of the same run, (N, d) float64
+    µm; NaN for cells that were born since. In a periodic space it is the way to the nearest image:
+    take states between which no cell goes half of the way between the faces, and add up several."""
+    known, before = _known_before("displacement", state, earlier)
+    moved = torch.full_like(state.position, torch.nan)
+    way = (state.position[known] - earlier.position[before]).T
+    moved[known] = (way if state.space is None else way + state.space.shift(way)).T
+    return moved
+
+
+def _known_before(measure: str, state: State, earlier: State) -> tuple[Tensor, Tensor]:
+    """The cells (M,) that an earlier state of the run has, too, and their places there, (M,).
+    Raises InputError for a state that is not earlier."""
     if not isinstance(earlier, State) or not earlier.time < state.time:
         shown = f"a state at {earlier.time:g} h" if isinstance(earlier, State) else earlier
         rule = f"a state of the same run before {state.time:g} h"
-        raise checks.input_error("growth_rates(earlier)", shown, rule)
+        raise checks.input_error(f"{measure}(earlier)", shown, rule)
     key = lambda s: torch.stack([s.own_colony_id, s.uid], 1)
-    both = torch.cat([key(earlier), key(state)])
-    _, which = torch.unique(both, dim=0, return_inverse=True)
-    before = torch.full((int(which.max()) + 1,) if len(which) else (0,), torch.nan).double()
-    before = before.to(state.device)
-    before[which[: earlier.cells]] = earlier.volume.double()
-    now = state.volume.double()
-    return (now / before[which[earlier.cells :]]).log() / (state.time - earlier.time)
+    names, which = torch.unique(torch.cat([key(earlier), key(state)]), dim=0, return_inverse=True)
+    place = torch.full((len(names),), -1, device=state.device)
+    place[which[: earlier.cells]] = torch.arange(earlier.cells, device=state.device)
+    before = place[which[earlier.cells :]]
+    known = torch.nonzero(before >= 0).squeeze(1)
+    return known, before[known]
 
 
 @of_a_state

@@ -10,6 +10,7 @@ import torch
 from torchfilm import measure
 from torchfilm.initial_cells import Cells
 from torchfilm.model import Model
+from torchfilm.physics.surfaces import FlatSurface
 from torchfilm.physics.walls import Wall
 from torchfilm.scene import Scene
 from torchfilm.state import State
@@ -22,12 +23,7 @@ def summary_table(scene: Scene, state: State, timings: Timings, seconds: float) 
     walls = _walls(scene)
     found = measure.overlaps(state, walls)
     pairs = found.count.sum().clamp(min=1)
-    counts = state.counts
-    radius = (
-        f"{float(measure.colony_radius(state).nanmean()):.1f} µm (mean)"
-        if state.cells
-        else "-: no cell is left (the lineage says why)"
-    )
+    counts, (what, size) = state.counts, _size(scene, state)
     lines = [
         f"{'colonies':<28}{state.colonies}",
         f"{'cells':<28}{state.cells} ({int(counts.min())} to {int(counts.max())} a colony)",
@@ -35,7 +31,7 @@ def summary_table(scene: Scene, state: State, timings: Timings, seconds: float) 
             f"{'time':<28}{state.time:g} h in {state.step} steps, {seconds:.1f} s on"
             f" {torch.get_num_threads()} thread{'' if torch.get_num_threads() == 1 else 's'}"
         ),
-        f"{'colony radius':<28}{radius}",
+        f"{what:<28}{size}",
         (
             f"{'overlap':<28}mean {float((found.mean * found.count).sum() / pairs):.4f} µm, worst"
             f" {float(found.worst.max()):.3f} µm"
@@ -54,6 +50,25 @@ def summary_table(scene: Scene, state: State, timings: Timings, seconds: float) 
         spent = f"{kernels.seconds_spent():.1f} s of these, {kernels.HOW_OFTEN}"
         lines.append(f"{'compiling':<28}{spent}")
     return "\n".join(lines)
+
+
+def _size(scene: Scene, state: State) -> tuple[str, str]:
+    """What says how large colonies are, and how large: their radius, or, on a floor along which
+    space is periodic, the thickness of the film."""
+    if not state.cells:
+        return "colony radius", "-: no cell is left (the lineage says why)"
+    ground, up = "xyz"[: state.dim - 1], [float(k == state.dim - 1) for k in range(state.dim)]
+    floors = [
+        s.offset
+        for s in scene.wall_surfaces()
+        if isinstance(s, FlatSurface) and list(s.normal) == up and isinstance(s.offset, float)
+    ]
+    faces = {} if state.space is None else state.space.faces
+    if len(floors) == 1 and set(faces) == set(ground):
+        film = measure.film(state, floor=floors[0])
+        thick, rough = (float(x.nanmean()) for x in (film.thickness, film.roughness))
+        return "film", f"{thick:.1f} µm thick, roughness {rough:.2f} (mean)"
+    return "colony radius", f"{float(measure.colony_radius(state).nanmean()):.1f} µm (mean)"
 
 
 def _walls(scene: Scene) -> list[Wall]:
