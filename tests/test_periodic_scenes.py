@@ -94,12 +94,11 @@ def test_displacements_add_up_across_faces():
     scene = tf.Scene(
         tf.Growth(rate=1.0), tf.Division(length=3.0), tf.Motility(speed=20.0),
         tf.Mechanics(dim=2, periodic=FACES),
-        founders=tf.Cells(position=[[19.0, 0.0]], axis=[[1.0, 0.0]], length=2.0), dt=0.01,
+        founders=tf.Cells(position=[[19.0, 0.0]], axis=[[1.0, 0.0]], length=2.0), dt=0.005,
     )  # fmt: skip
-    way, earlier = 0.0, None
+    way, earlier = 0.0, scene.bind(dtype=torch.float64).start()
     for state in tf.simulate(scene, until=0.3, dtype=torch.float64):
-        if earlier is not None:
-            way += float(tf.measure.displacement(state, earlier)[0, 0])
+        way += float(tf.measure.displacement(state, earlier)[0, 0])
         earlier = state
     assert way == pytest.approx(0.3 * 20.0, rel=1e-6) and float(state.position[0, 0]) < 19.0
     *_, later = tf.simulate(scene, until=0.6, dtype=torch.float64)
