@@ -103,7 +103,7 @@ def test_displacements_add_up_across_faces():
     assert way == pytest.approx(0.3 * 20.0, rel=1e-6) and float(state.position[0, 0]) < 19.0
     *_, later = tf.simulate(scene, until=0.6, dtype=torch.float64)
     assert later.cells == 2 and torch.isnan(tf.measure.displacement(later, state)).all()
-    with pytest.raises(tf.InputError, match=r"displacement\(earlier\) = a state at 0\.6 h"):
+    with pytest.raises(tf.InputError, match=r"displacement\(earlier\) = 'a state at 0\.6 h'"):
         tf.measure.displacement(later, later)
 
 
