@@ -182,6 +182,13 @@ def test_the_bulk_follows_the_surface(layer):
     assert float(nutrient[:, -1].min()) > 0.8 and float(nutrient[:, 0].max()) < 0.2
 
 
+def test_films_of_the_least_width_grow():
+    for seed in range(3):
+        scene = tf.scenes.biofilm(diffusion=1e5, width=14.0, first=2, height=24.0)
+        *_, state = tf.simulate(scene, until=5.0, seed=seed)
+        assert state.cells > 20
+
+
 def test_the_command_tells_the_thickness_of_a_film():
     from torchfilm.cli.report import _size
 
@@ -201,7 +208,7 @@ def test_what_does_not_make_a_biofilm_is_refused():
         tf.InputError, match=r"biofilm\(width\) = 41.*a whole number of voxels of 2"
     ):
         tf.scenes.biofilm(width=41.0)
-    with pytest.raises(tf.InputError, match=r"biofilm\(width\) = 8.*12"):
+    with pytest.raises(tf.InputError, match=r"biofilm\(width\) = 8.*at least 14"):
         tf.scenes.biofilm(width=8.0, first=1)
     with pytest.raises(tf.InputError, match=r"biofilm\(first\) = 9.*at most 8 on a floor 40 µm"):
         tf.scenes.biofilm(first=9, width=40.0)

@@ -146,6 +146,53 @@ def test_masks_and_images_show_both_parts_of_a_cell_at_a_face(recorded, tmp_path
     assert (tifffile.imread(tmp_path / "wide.tif") > 0).sum() == pytest.approx(300 * area, rel=0.01)
 
 
+def test_fluorescence_shows_both_parts_and_ground_truth_whole_cells(recorded, tmp_path):
+    """An image of light has two parts of the cell at a face; tracks have it once, beyond the
+    face."""
+    tifffile = pytest.importorskip("tifffile")
+    _, path = recorded
+    with tf.Results(path) as results:
+        results.to_ome_tiff(
+            tmp_path / "light.ome.tif", channels={"length": 1.0}, pixel_size=0.1, frames=[0]
+        )
+        results.to_ctc(tmp_path / "truth", channels={"length": 1.0}, pixel_size=0.1)
+    light = tifffile.imread(tmp_path / "light.ome.tif").squeeze()
+    assert light.shape[-1] == 200 and light[:, :10].max() > 0 and light[:, -10:].max() > 0
+    (mask, *_) = sorted((tmp_path / "truth").rglob("man_seg*.tif"))
+    whole = tifffile.imread(mask)
+    columns = np.flatnonzero((whole > 0).any(0))
+    assert len(columns) == columns[-1] - columns[0] + 1 and len(columns) == pytest.approx(30, abs=2)
+
+
+def test_sections_show_cells_across_the_upper_face(tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    faces = dict.fromkeys("xyz", (0.0, 20.0))
+    scene = tf.Scene(
+        tf.Mechanics(periodic=faces),
+        founders=tf.Cells(position=[[10.0, 10.0, 0.1]], axis=[[1.0, 0.0, 0.0]], length=2.0),
+    )
+    for _ in tf.simulate(scene, until=0.1, dt=0.1, record=tmp_path / "run.h5"):
+        pass
+    with tf.Results(tmp_path / "run.h5") as results:
+        for name, z in (("low", 0.4), ("high", 19.8)):
+            results.to_labels(tmp_path / f"{name}.tif", pixel_size=0.1, frames=[0], z=z)
+        with pytest.raises(tf.InputError, match="between the faces"):
+            results.to_labels(tmp_path / "no.tif", pixel_size=0.1, frames=[0], z=-0.2)
+    low, high = (tifffile.imread(tmp_path / f"{name}.tif") for name in ("low", "high"))
+    assert low.any() and (low == high).all()  # 0.3 µm above and below its axis
+
+
+def test_the_limit_of_lengths_counts_what_contacts_reach():
+    """2.5 µm with caps and 0.3 µm: 2.75 of half a period are too few, 2.85 are enough."""
+    for half, fails in ((2.75, True), (2.85, False)):
+        scene = tf.Scene(
+            tf.Mechanics(dim=2, periodic={"x": (0.0, 2 * half)}),
+            founders=tf.Cells(position=[[1.0, 0.0]], axis=[[0.0, 1.0]], length=1.5),
+        )
+        model = scene.bind()
+        assert bool(tf.failures(model.step(model.start(), 0.01))) == fails
+
+
 def test_pictures_show_images_beyond_the_faces(recorded):
     from torchfilm.pictures.shapes import with_images
 

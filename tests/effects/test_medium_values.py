@@ -149,6 +149,10 @@ BAD = {
         lambda: tf.Medium(ahl=AHL, margin=4.0, **GOOD),
         r"Medium\.margin = 4\.0.*outside='grow'",
     ),
+    "margin of too many voxels": (
+        lambda: tf.Medium(ahl=AHL, outside="grow", margin=1e5, **GOOD),
+        r"Medium\.margin = 100000\.0.*at most 67 million voxels",
+    ),
     "no margin": (
         lambda: tf.Medium(ahl=AHL, outside="grow", margin=0.0, **GOOD),
         r"Medium\.margin",

@@ -339,7 +339,7 @@ class GridCoverage(_MediumPart):
         if bool(((low >= layout.grid.origin) & (high <= layout.grid.high)).all()):
             return state
         # a colony that needs more voxels than allowed, or whose positions are not finite, keeps its
-        # grid; its cells are then outside the grid, which is reported
+        # grid; cells that come to be outside are reported
         size = (
             (torch.maximum(high, layout.grid.high) - torch.minimum(low, layout.grid.origin))
             / layout.grid.step

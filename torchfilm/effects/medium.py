@@ -25,7 +25,13 @@ from torchfilm.parameters import number_range
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.exchange import turns_error
 from torchfilm.signals.schedule import Schedule, each_value
-from torchfilm.signals.space import check_growing, check_same_faces, check_used, checked_box
+from torchfilm.signals.space import (
+    check_growing,
+    check_margin,
+    check_same_faces,
+    check_used,
+    checked_box,
+)
 from torchfilm.signals.transport import COMPILED, METHODS
 from torchfilm.signals.transport_series import MOST
 from torchfilm.state import COLONY, GRID, OUTSIDE, Field, State
@@ -152,6 +158,8 @@ class Medium(Effect):
             object.__setattr__(self, "boundary", _still(self.boundary))
             object.__setattr__(self, "signals", still)
         self._check_periodic()
+        if margin is not None:
+            check_margin(margin, grows, (low, high), voxel)
         check_used(self)
 
     def _check_periodic(self) -> None:

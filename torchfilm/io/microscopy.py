@@ -53,14 +53,16 @@ class View:
         return columns, Rods(centre, axis, length / 2, radius)
 
     def seen(self, rods: Rods, raster: Raster) -> tuple[Rods, np.ndarray]:
-        """The cells, and those images of them that reach into the raster; and which cell each
-        is."""
+        """The cells, and those images of them that reach into the raster, and in space into the
+        section; and which cell each is."""
         which = np.arange(len(rods.half))
-        for k, axis in enumerate("xy"):
-            if axis in self.faces:
-                low, high = self.faces[axis]
-                rods, more = rods.repeated(k, high - low, raster.span[k])
-                which = which[more]
+        spans = dict(zip("xy", raster.span, strict=True))
+        if self.z is not None:
+            spans["z"] = self.z, self.z
+        for axis in spans.keys() & self.faces.keys():
+            low, high = self.faces[axis]
+            rods, more = rods.repeated("xyz".index(axis), high - low, spans[axis])
+            which = which[more]
         return rods, which
 
 
@@ -104,7 +106,13 @@ def view_of(
 
 
 def _check_height(view: View, z: float) -> None:
-    """Raise InputError for a section that meets no cell in any frame."""
+    """Raise InputError for a section that meets no cell in any frame, or is beyond the faces."""
+    if "z" in view.faces:
+        lowest, highest = view.faces["z"]
+        if not lowest <= z <= highest:
+            rule = f"from {lowest:g} to {highest:g} µm, between the faces"
+            raise checks.input_error("z", z, rule)
+        return
     low, high = np.inf, -np.inf
     for k in view.frames:
         rods = view.cells(k)[1]

@@ -52,7 +52,7 @@ class Rods:
     def repeated(self, k: int, period: float, span: tuple[float, float]) -> tuple[Rods, np.ndarray]:
         """The cells, and their images every `period` µm along axis k that reach into a span; and
         which cell each is."""
-        x, reach = self.centre[:, k], self.reach[:, k]
+        x, reach = self.centre[:, k], np.abs(self.axis[:, k]) * self.half + self.radius
         parts, moves = [np.arange(len(x))], [np.zeros(len(x))]
         if len(x):
             first = math.floor((span[0] - x.max() - reach.max()) / period)

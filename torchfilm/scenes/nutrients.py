@@ -58,9 +58,9 @@ def nutrient_limited(
 
 
 # µm: how far below the top of the medium cells are carried away, the least space between the first
-# cells, and the least width: cells grow up to 5.5 µm long, with their caps, and must be shorter
-# than half of it.
-BELOW, APART, NARROWEST = 4.0, 5.0, 12.0
+# cells, and the least width: cells grow up to 5.8 µm long, with their caps, at 1/h; with the 0.3 µm
+# that contacts reach they must be shorter than half of it.
+BELOW, APART, NARROWEST = 4.0, 5.0, 14.0
 
 
 def biofilm(

@@ -114,6 +114,21 @@ def check_growing(periodic: Sequence[bool], outside: str, grows: str) -> None:
         )
 
 
+def check_margin(
+    margin: float, grows: str, box: tuple[Sequence[float], Sequence[float]],
+    spacing: Sequence[float],
+) -> None:  # fmt: skip
+    """Raise InputError for a margin with which no box has as few voxels as one may have."""
+    voxels = 1.0
+    for axis, low, high, step in zip("xyz", *box, spacing, strict=False):
+        faces = 2 if f"+{axis}" not in grows and f"-{axis}" not in grows else 1
+        least = faces * margin if axis in grows and high - low > step else 0.0
+        voxels *= max(high - low, least) / step
+    if voxels > MOST_VOXELS:
+        rule = f"so small that a box has at most {MOST_VOXELS / 1e6:.0f} million voxels"
+        raise checks.input_error("Medium.margin", margin, rule, "Or take a greater spacing.")
+
+
 def check_same_faces(
     faces: Mapping[str, tuple[float, float]], periodic: Sequence[bool],
     box: tuple[Sequence[float], Sequence[float]],
