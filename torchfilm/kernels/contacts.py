@@ -56,13 +56,22 @@ def most_rows(dof):
 
 
 @lean(inline=True)
-def _put_cells(block, k, i, j, x, axis, half, radius, periods, dof):
+def _put_cells(block, k, i, j, x, axis, half, radius, dof):
     """Puts the cells i and j into column k."""
     for c in range(2 if len(dof) == 4 else 3):
-        block[B + c, k] = nearest(x[j, c] - x[i, c], periods[c])
+        block[B + c, k] = x[j, c] - x[i, c]
         block[A + c, k], block[C + c, k] = axis[i, c], axis[j, c]
     block[HALF_A, k], block[HALF_B, k] = half[i], half[j]
     block[RADIUS_A, k], block[RADIUS_B, k] = radius[i], radius[j]
+
+
+@lean(inline=True)
+def _take_nearest(block, count, periods, dof):
+    """Of the first `count` columns, the way to the nearest image of the other cell."""
+    for c in range(2 if len(dof) == 4 else 3):
+        if periods[c] > 0.0:
+            for k in range(count):
+                block[B + c, k] = nearest(block[B + c, k], periods[c])
 
 
 @lean(inline=True)
@@ -148,7 +157,8 @@ def near_contacts_of(x, axis, half, radius, periods, first, second, margin, begi
         count = min(PAIRS, end - start)
         for k in range(count):
             i, j = index(first[start + k]), index(second[start + k])
-            _put_cells(block, k, i, j, x, axis, half, radius, periods, dof)
+            _put_cells(block, k, i, j, x, axis, half, radius, dof)
+        _take_nearest(block, count, periods, dof)
         vectors = (count + WIDTH - 1) // WIDTH
         _measure(shaped(block, (FIRST_ROW * VECTORS, WIDTH)), vectors, margin, dof)
         for k in range(count):  # without branches: their outcome is not foreseen
@@ -168,7 +178,8 @@ def deepest_of(memory, x, axis, half, radius, periods, found, dof):
         some = keep[start : start + PAIRS]
         for k in range(some.shape[0]):
             i, j = index(first[index(some[k])]), index(second[index(some[k])])
-            _put_cells(block, k, i, j, x, axis, half, radius, periods, dof)
+            _put_cells(block, k, i, j, x, axis, half, radius, dof)
+        _take_nearest(block, some.shape[0], periods, dof)
         vectors = (some.shape[0] + WIDTH - 1) // WIDTH
         _measure(shaped(block, (FIRST_ROW * VECTORS, WIDTH)), vectors, 0.0, dof)
         for k in range(some.shape[0]):
@@ -370,8 +381,9 @@ def pair_rows_of(x, axis, half, radius, periods, scale, found, begin, end, place
         some = keep[start : min(start + PAIRS, end)]
         for k in range(some.shape[0]):
             i, j = index(first[index(some[k])]), index(second[index(some[k])])
-            _put_cells(block, k, i, j, x, axis, half, radius, periods, dof)
+            _put_cells(block, k, i, j, x, axis, half, radius, dof)
             block[S0, k], block[T0, k] = points[start + k, 0], points[start + k, 1]
+        _take_nearest(block, some.shape[0], periods, dof)
         vectors = (some.shape[0] + WIDTH - 1) // WIDTH
         if _put_rows(shaped(block, (COLUMNS * VECTORS, WIDTH)), vectors, margin, dof):
             for k in range(some.shape[0]):
