@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchfilm.physics.space import checked_spans
 from torchfilm.state import State
 from torchfilm.tools import checks
 
@@ -51,7 +52,7 @@ def film_of(
     ]
     periodic = [state.space is not None and a in state.space.faces for a in ground]
     columns = torch.cartesian_prod(*[torch.arange(-s, s + 1, device=state.device) for s in spread])
-    size = state.colonies * int(torch.tensor(counts).prod())
+    size = state.colonies * math.prod(counts)
     height = points.new_zeros(size)
     for offset in columns.reshape(-1, len(counts)):
         place, apart = colony, torch.zeros_like(radius)
@@ -59,7 +60,8 @@ def film_of(
         for k, ((low, _), step, count) in enumerate(zip(spans, steps, counts, strict=True)):
             column = nearest[k] + offset[k]
             apart = apart + (low + (column + 0.5) * step - points[:, k]) ** 2
-            inside &= torch.full_like(inside, periodic[k]) | ((column >= 0) & (column < count))
+            if not periodic[k]:
+                inside &= (column >= 0) & (column < count)
             place = place * count + column % count
         rise = radius * radius - apart
         meets = inside & (rise >= 0)
@@ -85,27 +87,19 @@ def _spans(
             if bool((low[:, k] == low[0, k]).all() & (high[:, k] == high[0, k]).all()):
                 found[axis] = float(low[0, k]), float(high[0, k])
     found |= {} if state.space is None else state.space.faces
-    if across is not None and not isinstance(across, Mapping):
-        rule = 'a dict of axes and spans in µm, such as {"x": (0, 40)}'
-        raise checks.input_error("film(across)", across, rule)
-    for axis, span in (across or {}).items():
-        if axis not in tuple(ground):
-            raise checks.input_error("film(across), axis", axis, " or ".join(map(repr, ground)))
-        if not isinstance(span, (tuple, list)) or len(span) != 2:
-            raise checks.input_error(f"film(across)[{axis!r}]", span, "(low, high) in µm")
-        low_end = checks.number(f"film(across)[{axis!r}], low", span[0])
-        high_end = checks.number(f"film(across)[{axis!r}], high", span[1], above=low_end)
+    for axis, span in checked_spans(
+        "film(across)", {} if across is None else across, ground
+    ).items():
         faces = {} if state.space is None else state.space.faces
-        if faces.get(axis, (low_end, high_end)) != (low_end, high_end):
+        if faces.get(axis, span) != span:
             rule = f"left out along {axis}, where space is periodic"
             raise checks.input_error("film(across)", across, rule)
-        found[axis] = low_end, high_end
+        found[axis] = span
     if missing := [a for a in ground if a not in found]:
         raise checks.InputError(
             f"film does not know how far the floor reaches along {' and '.join(missing)}: space is"
             " not periodic there, and there is no medium that is as wide in all colonies. Give it,"
-            " such as"
-            f" across={{{missing[0]!r}: (0, 40)}}."
+            f" such as across={{{missing[0]!r}: (0, 40)}}."
         )
     return [found[a] for a in ground]
 

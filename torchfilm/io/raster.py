@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+
+from torchfilm.tools.images import images_seen
 
 AT_ONCE = 500_000  # pixels of boxes around cells that are looked at in one go
 
@@ -52,18 +53,11 @@ class Rods:
     def repeated(self, k: int, period: float, span: tuple[float, float]) -> tuple[Rods, np.ndarray]:
         """The cells, and their images every `period` µm along axis k that reach into a span; and
         which cell each is."""
-        x, reach = self.centre[:, k], np.abs(self.axis[:, k]) * self.half + self.radius
-        parts, moves = [np.arange(len(x))], [np.zeros(len(x))]
-        if len(x):
-            first = math.floor((span[0] - x.max() - reach.max()) / period)
-            last = math.ceil((span[1] - x.min() + reach.max()) / period)
-            for turn in (t for t in range(first, last + 1) if t):
-                at = x + turn * period
-                (seen,) = np.nonzero((at + reach > span[0]) & (at - reach < span[1]))
-                parts.append(seen)
-                moves.append(np.full(len(seen), turn * period))
-        which, centre = np.concatenate(parts), self.centre[np.concatenate(parts)]
-        centre[:, k] += np.concatenate(moves)
+        reach = np.abs(self.axis[:, k]) * self.half + self.radius
+        more, away = images_seen(self.centre[:, k], reach, period, *span)
+        which = np.concatenate([np.arange(len(reach)), more])
+        centre = self.centre[which]
+        centre[len(reach) :, k] += away
         return Rods(centre, self.axis[which], self.half[which], self.radius[which]), which
 
 

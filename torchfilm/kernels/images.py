@@ -11,9 +11,7 @@ import numpy as np
 
 from torchfilm.kernels.compiling import kernel, lean
 from torchfilm.kernels.memory import room
-
-# By how much the reach of cells is enlarged, so that rounding loses no pair that touches exactly.
-ENLARGED = 1e-5
+from torchfilm.kernels.scheme import ENLARGED
 
 
 @lean(inline=True)

@@ -74,6 +74,9 @@ RAISED = 1e-9
 ROUNDING = 1e-6
 # Lengths that stop at their bound step alone in the round after one that went less than this share.
 CREEP = 0.5
+# By how much the reach of cells in a periodic space is enlarged, so that rounding loses no pair
+# that touches exactly.
+ENLARGED = 1e-5
 # Sub-steps at most.
 MOST_SUBSTEPS = 1000
 # A colony whose contacts do not hold has more than BURIED of its cells (of MANY, if it has fewer)

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchfilm.kernels.scheme import ENLARGED
 from torchfilm.physics.neighbours import Neighbourhood
 from torchfilm.physics.surfaces import FlatSurface, Surface
 from torchfilm.tools import checks
@@ -19,8 +20,23 @@ from torchfilm.tools.reads import rows_where
 
 AXES = "xyz"
 Faces = Mapping[str, tuple[float, float]]  # (low, high) µm by axis
-# By how much the reach of cells is enlarged, so that rounding loses no pair that touches exactly.
-ENLARGED = 1e-5
+
+
+def checked_spans(name: str, given: Any, axes: str) -> dict[str, tuple[float, float]]:
+    """From {"x": (low, high), …}, µm. Raises InputError, which names `name`."""
+    if not isinstance(given, Mapping):
+        rule = 'a dict of axes and their ends in µm, such as {"x": (0, 40)}'
+        raise checks.input_error(name, given, rule)
+    found = {}
+    for axis, ends in given.items():
+        if axis not in tuple(axes):
+            raise checks.input_error(f"{name}, axis", axis, " or ".join(map(repr, axes)))
+        if isinstance(ends, (str, Mapping)) or not hasattr(ends, "__len__") or len(ends) != 2:
+            rule = "(low, high) in µm, the same for all colonies"
+            raise checks.input_error(f"{name}[{axis!r}]", ends, rule)
+        low = checks.number(f"{name}[{axis!r}], low", ends[0])
+        found[axis] = low, checks.number(f"{name}[{axis!r}], high", ends[1], above=low)
+    return found
 
 
 @dataclass(frozen=True)
@@ -40,24 +56,9 @@ class PeriodicSpace:
         """From {"x": (low, high), …}; None of no axis. Raises InputError, which names `name`."""
         if given is None:
             return None
-        if not isinstance(given, Mapping):
-            rule = 'a dict of axes and their faces in µm, such as {"x": (0, 40)}'
-            raise checks.input_error(name, given, rule)
-        axes, low, high = AXES[:dim], [0.0] * dim, [0.0] * dim
-        for axis, faces in given.items():
-            if axis not in tuple(axes):
-                raise checks.input_error(f"{name}, axis", axis, " or ".join(map(repr, axes)))
-            if (
-                isinstance(faces, (str, Mapping))
-                or not hasattr(faces, "__len__")
-                or len(faces) != 2
-            ):
-                rule = "(low, high) in µm, the same for all colonies"
-                raise checks.input_error(f"{name}[{axis!r}]", faces, rule)
-            k = axes.index(axis)
-            low[k] = checks.number(f"{name}[{axis!r}], low", faces[0])
-            high[k] = checks.number(f"{name}[{axis!r}], high", faces[1], above=low[k])
-        return PeriodicSpace(tuple(low), tuple(high)) if given else None
+        faces, axes = checked_spans(name, given, AXES[:dim]), AXES[:dim]
+        low, high = ([faces.get(a, (0.0, 0.0))[end] for a in axes] for end in (0, 1))
+        return PeriodicSpace(tuple(low), tuple(high)) if faces else None
 
     @cached_property
     def period(self) -> tuple[float, ...]:
@@ -126,8 +127,8 @@ class PeriodicSpace:
         periods = torch.tensor(self.period, dtype=position.dtype, device=position.device)
         first = groups.begin[:-1].clamp(max=position.shape[0] - 1).index_select(0, groups.owner)
         away = position - position.index_select(0, first)
-        turns = torch.floor(away / torch.where(periods > 0, periods, 1.0) + 0.5)
-        base, away = (x - periods * turns for x in (position, away))
+        move = self.shift(away.T).T
+        base, away = position + move, away + move
         most = torch.stack([groups.max(x) for x in side.unbind(1)], 1).index_select(0, groups.owner)
         meets = away + 0.5 * periods <= (side + most) * (1 + ENLARGED)
         every = [(False, True) if period else (False,) for period in self.period]
@@ -175,12 +176,8 @@ class Images:
         between = self.base.index_select(0, high) - self.base.index_select(0, low)
         moved = self.way.index_select(0, second).long() - self.way.index_select(0, first).long()
         moved = torch.where((i < j).unsqueeze(1), moved, -moved)
-        nearest = torch.ones_like(i, dtype=torch.bool)
-        for k, period in enumerate(self.space.period):
-            if period:
-                wanted = -torch.floor(between[:, k] / period + 0.5)
-                nearest &= moved[:, k] == wanted
-        (keep,) = rows_where(nearest)
+        periods = torch.tensor(self.space.period, dtype=between.dtype, device=between.device)
+        (keep,) = rows_where((moved * periods == self.space.shift(between.T).T).all(1))
         return i.index_select(0, keep), j.index_select(0, keep)
 
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from torchfilm.tools import checks
+from torchfilm.tools.images import images_seen
 
 # The axes of space to the right and up in each view.
 VIEWS = {"xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
@@ -59,17 +60,12 @@ def with_images(
         if "xyz"[k] not in faces:
             continue
         low, high = faces["xyz"[k]]
-        x = cells["position"][:, k]
         reach = 0.5 * cells["length"] * np.abs(cells["axis"][:, k]) + cells["radius"]
-        left, right = min(left, right), max(left, right)
-        parts, period = [cells], high - low
-        turns = range(math.floor((left - high) / period), math.ceil((right - low) / period) + 1)
-        for shift in (turn * period for turn in turns if turn):
-            seen = (x + shift + reach > left) & (x + shift - reach < right)
-            image = {name: value[seen] for name, value in cells.items()}
-            move = np.eye(cells["position"].shape[1])[k] * shift
-            parts.append({**image, "position": image["position"] + move})
-        cells = {name: np.concatenate([part[name] for part in parts]) for name in cells}
+        seen = min(left, right), max(left, right)
+        more, away = images_seen(cells["position"][:, k], reach, high - low, *seen)
+        which = np.concatenate([np.arange(len(reach)), more])
+        cells = {name: value[which] for name, value in cells.items()}
+        cells["position"][len(reach) :, k] += away
     return cells
 
 
