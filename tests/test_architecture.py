@@ -61,6 +61,7 @@ ROOMS = {
             "torchfilm.scene",
             "torchfilm.model",
             "torchfilm.joined_step",
+            "torchfilm.cpu_parts",
             "torchfilm.turns",
             "torchfilm.together",
             "torchfilm.binding_checks",

@@ -6,7 +6,7 @@ from __future__ import annotations
 import copy
 import pickle
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import pytest
 import torch
@@ -234,3 +234,21 @@ def test_an_effect_that_looks_for_divisions_too_early_is_warned_of(stage, divisi
     said = [str(w.message) for w in told if "births" in str(w.message)]
     wanted = f"Count reads state.births at stage 50, and cells divide at stage {late}"
     assert len(said) == (late > 0) and all(x.startswith(wanted) for x in said)
+
+
+def test_descriptions_with_keywords_of_their_own_can_be_replaced():
+    """Of `Medium` and `Circuit`, whose signals and constants are keywords."""
+    medium = tf.Medium(ahl=tf.Signal(10.0), box=((-8, -8), (8, 8)), spacing=4.0, depth=2.0)
+    other = replace(medium, backend="torch")
+    assert other.backend == "torch" and repr(other.signals) == repr(medium.signals)
+    assert (other.box, other.spacing, other.depth) == (medium.box, medium.spacing, 2.0)
+    circuit = tf.Circuit(lambda u, s, p, cell: {"m": p.k - u.m}, species=("m",), k=2.0,
+                         shared={"g": "growth"}, dilution=False)  # fmt: skip
+    changed = replace(circuit, rtol=1e-3)
+    for f in fields(circuit):
+        assert f.name == "rtol" or getattr(changed, f.name) == getattr(circuit, f.name), f.name
+    by_type = tf.Circuit({0: circuit.rates["every cell"], 2: lambda u, s, p, cell: {"m": -u.m}},
+                         species=("m",), k=2.0)  # fmt: skip
+    assert replace(by_type, steps=1).rates == by_type.rates
+    with pytest.raises(tf.InputError, match="k = -inf"):
+        replace(circuit, parameters={"k": -torch.inf})

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_devices import SMALL, STEPS, check_as_on_the_cpu, columns
+from test_cpu_parts import check_bits_of_the_cpu
+from test_devices import KINDS, SMALL, STEPS, by_torch, check_as_on_the_cpu, columns
 
 import torchfilm as tf
 
@@ -44,9 +45,15 @@ def test_a_scene_comes_to_what_it_does_on_the_cpu(name):
 
 
 @pytest.mark.parametrize("name", STEPS)
+def test_kernels_have_the_bits_of_the_cpu(name):
+    check_bits_of_the_cpu(name)
+
+
+@pytest.mark.parametrize("kinds", [(), KINDS], ids=["kernels", "torch"])
+@pytest.mark.parametrize("name", STEPS)
 @torch.no_grad()
-def test_the_same_bits_again_alone_and_after_a_restart(name, tmp_path):
-    scene, steps = tf.scenes.build(name, SMALL.get(name)), STEPS[name]
+def test_the_same_bits_again_alone_and_after_a_restart(name, kinds, tmp_path):
+    scene, steps = by_torch(tf.scenes.build(name, SMALL.get(name)), *kinds), STEPS[name]
     whole = grown(scene, steps, 3)
     check_same_bits(whole, grown(scene, steps, 3))
     half, rest = steps // 2, steps - steps // 2

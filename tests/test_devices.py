@@ -25,19 +25,24 @@ STEPS = {
     "nutrient_limited": 5,
     "biofilm": 4,
 }
+KINDS = (tf.Mechanics, tf.Circuit, tf.Medium)  # whose backend may be chosen
 SMALL = {
     "strain_sorting": {"cells": 40, "chamber": 10.0},
     "biofilm": {"width": 16.0, "height": 20.0, "first": 3},
 }
 
 
+def by_torch(scene: tf.Scene, *kinds: type) -> tf.Scene:
+    """The scene, with its effects of these kinds by torch."""
+    change = lambda e: replace(e, backend="torch") if isinstance(e, kinds) else e
+    return scene.replace(*(change(e) for e in scene.effects))
+
+
 def grown(name: str, device: str) -> tf.State:
-    """Contacts by torch also on the CPU, as on CUDA: after many steps, the 1e-10 by which kernels
+    """By torch on CUDA, and contacts also on the CPU: after many steps, the 1e-10 by which kernels
     differ (tests/physics/test_compiled.py) would hide what a device changes."""
     scene = tf.scenes.build(name, SMALL.get(name))
-    if device == "cpu":
-        by_torch = lambda e: replace(e, backend="torch") if isinstance(e, tf.Mechanics) else e
-        scene = scene.replace(*(by_torch(e) for e in scene.effects))
+    scene = by_torch(scene, *([tf.Mechanics] if device == "cpu" else KINDS))
     state = scene.bind(2, device=device, dtype=torch.float64).start()
     for _ in range(STEPS[name]):
         state = step(scene, state, scene.dt)

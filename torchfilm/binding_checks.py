@@ -1,5 +1,6 @@
 """What is checked of the effects of a bound scene together: that the names exist which they read
-and write, that none is idle or comes too early, and that a run to a number of cells can end."""
+and write, that none is idle or comes too early, that a run to a number of cells can end; and
+whether growth can be recorded."""
 
 from __future__ import annotations
 
@@ -10,10 +11,12 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import BUILT_IN, BoundEffect, Effect, is_own, makes_longer
+from torchfilm.parameters import parameters
 from torchfilm.resolver import FirstValue
 from torchfilm.rule_views import KNOWN_FIELDS, MEANS
 from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
+from torchfilm.tools.tangents import tracked
 from torchfilm.tools.warn_once import warn
 
 if TYPE_CHECKING:
@@ -208,3 +211,34 @@ def check_fits(state: object, model: Model, fields: Mapping[str, object]) -> Non
     alike = state.dim == model.dim and state.dtype == model.batch.dtype
     if not (alike and fields.keys() <= state.fields.keys()):
         model.check(state)
+
+
+def why_not_replayable(model: Model) -> str:
+    """Why the growth of a model cannot be recorded for other designs, or ""."""
+    anything = [e.title for e in model.effects if e.effect.writes_anything]
+    if anything:
+        return f"{anything[0]} may read and write anything"
+    if model.scene.founders.colony is not None:
+        return "its first cells name their colonies, so that these do not start alike"
+    for e in model.effects:
+        for f in e.declares():
+            if f.scope != CELL and e.place in model.recorded:
+                for mover in model.effects:
+                    used = f.name in (*mover.reads(), *mover.writes())
+                    if used and {*mover.writes()} & {*BUILT_IN}:
+                        return (
+                            f"{mover.title} acts on growth or motion and needs {f.name!r}, which is"
+                            " no quantity of cells"
+                        )
+                return (
+                    f"{e.effect.title} acts on growth or motion by {f.name!r}, which is no quantity"
+                    " of cells"
+                )
+    if not model.following:
+        return "every effect acts on growth or motion"
+    for path, tensor in (x for k in model.recorded for x in parameters(model.scene.effects[k])):
+        if tensor.dim() == 1:
+            return f"{path} differs between colonies and acts on their growth"
+        if tracked(tensor):
+            return f"a derivative by {path} is wanted, which recorded growth does not carry"
+    return ""

@@ -53,7 +53,8 @@ def explain(
     lines = [scene.headline]
     for effect in model.effects:
         lines.append(f"  {effect.title:<10} {effect.summary()}")
-        lines += [f"             {words}" for words in effect.numerics(scene.dt, state)]
+        lines += [f"             {words}" for words in model.numerics(effect, state)]
+    lines += [f"  {words}" for words in ([] if model.twins is None else model.twins.in_words())]
     lines += ["  who drives whom:", *(f"    {line}" for line in model.drives())]
     lines.append(
         f"  not simulated: {', '.join(left_out(scene)) or 'nothing'}"

@@ -20,23 +20,21 @@ import torch
 from torch import Tensor
 
 from torchfilm import binding_checks
+from torchfilm.cpu_parts import CpuTwins, OnCpu, Part
 from torchfilm.effect import BUILT_IN, DIVISION, FLAGGED_DIVISION, Binding, BoundEffect
 from torchfilm.founders import FirstCells
 from torchfilm.initial_cells import Cells
 from torchfilm.joined_step import JoinedStep, joined
-from torchfilm.parameters import parameters
 from torchfilm.resolver import BoundBatch
 from torchfilm.state import CELL, PER_CELL, Field, State
-from torchfilm.together import Together
 from torchfilm.tools import checks, displays
 from torchfilm.tools.hashing import digest
 from torchfilm.tools.row_checks import check_declared, check_geometry
-from torchfilm.tools.tangents import tracked
 from torchfilm.tools.threads import after_fork, one_torch_thread
 from torchfilm.tools.times import later
 from torchfilm.tools.timing import Timings
 from torchfilm.tools.warn_once import once
-from torchfilm.turns import Turns, in_turns
+from torchfilm.turns import in_turns
 
 if TYPE_CHECKING:
     from torchfilm.scene import Scene
@@ -72,6 +70,7 @@ class Model:
         self.effects: tuple[BoundEffect, ...] = tuple(sorted(bound, key=lambda e: e.stage))
         self._said: set[str] = set()  # what steps have warned of
         self._space = scene.space
+        self.twins: CpuTwins | None = None  # of its effects, on a GPU
 
     # --- running -------------------------------------------------------------------------
 
@@ -97,8 +96,8 @@ class Model:
 
     def opened(self, state: State) -> State:
         """The state as a step of this model begins, also where another model made it."""
-        binding_checks.check_fits(state, self, self._first_fields)
-        declared = {**state.declared, **self._first_fields}
+        binding_checks.check_fits(state, self, self.first_fields)
+        declared = {**state.declared, **self.first_fields}
         new = {"declared": declared, "space": self._space}
         state = state.replace(births=(), ended=(), reports={}, **new)
         for effect in self._openers:
@@ -106,14 +105,18 @@ class Model:
         return state
 
     @cached_property
-    def step_parts(self) -> list[BoundEffect | Turns | Together]:
+    def step_parts(self) -> list[Part | OnCpu]:
         """The effects in the order of a step, some of them in turns."""
-        return in_turns(self.effects)
+        if self.twins is not None:
+            return self.twins.parts
+        return [*in_turns(self.effects)]
 
     @cached_property
-    def _joined_parts(self) -> list[BoundEffect | JoinedStep | Turns | Together]:
+    def _joined_parts(self) -> list[Part | JoinedStep | OnCpu]:
         """What a step runs: these, some of them joined."""
-        return joined(self.step_parts)
+        if self.twins is not None:
+            return self.twins.joined_parts
+        return [*joined(in_turns(self.effects))]
 
     @cached_property
     def _openers(self) -> list[BoundEffect]:
@@ -122,8 +125,9 @@ class Model:
 
     @cached_property
     def _by_kernels(self) -> bool:
-        """Whether kernels compute some effect, on the CPU."""
-        return self.batch.device.type == "cpu" and any(e.by_kernels for e in self.effects)
+        """Whether kernels compute some effect."""
+        on_cpu = self.batch.device.type == "cpu"
+        return self.twins is not None or (on_cpu and any(e.by_kernels for e in self.effects))
 
     def _laid(self) -> State:
         start = self._begin
@@ -133,14 +137,14 @@ class Model:
             state = state.replace(stream=start.streams.to(self.batch.device))
         for effect in self.effects:
             state = effect.lay(state)
-        for field in self._first_fields.values():
+        for field in self.first_fields.values():
             state = (
                 _with_given(state, field) if field.name in state.fields else state.declare(field)
             )
         return state
 
     @cached_property
-    def _first_fields(self) -> dict[str, Field]:
+    def first_fields(self) -> dict[str, Field]:
         """Fields that the effects declare, those declared alike once."""
         found: dict[str, Field] = {}
         # first values of others may go by thresholds of division, which comes late in a step
@@ -163,6 +167,7 @@ class Model:
             tried = effect.trace(tried)
         for effect in self.effects:  # now that it is known what rules write
             effect.check_others(self.effects)
+        self.twins = CpuTwins.of_model(self, self._begin, tried)
         return tried
 
     # --- checks --------------------------------------------------------------------------
@@ -211,6 +216,14 @@ class Model:
             binding_checks.warn_of_no_growth(self.effects)
         else:
             binding_checks.check_end(self.effects, state, cells)
+
+    def numerics(self, effect: BoundEffect, state: State) -> list[str]:
+        """By which methods an effect of this model is computed where no derivative is wanted, in
+        lines."""
+        twin = None if self.twins is None else self.twins.twin(effect)
+        if twin is None:
+            return effect.numerics(self.dt, state)
+        return twin.numerics(self.dt, state.to("cpu"))
 
     # --- what depends on what ------------------------------------------------------------
 
@@ -296,7 +309,7 @@ class Model:
     @cached_property
     def why_not_replayable(self) -> str:
         """Why growth cannot be recorded once for all designs of this scene, or "" if it can."""
-        return why_not_replayable(self)
+        return binding_checks.why_not_replayable(self)
 
     def __repr__(self) -> str:
         b = self.batch
@@ -309,37 +322,6 @@ def advanced(state: State, dt: float) -> State:
     rounding."""
     state.check_fields()
     return state.replace(step=state.step + 1, time=later(state.time, state.step, dt))
-
-
-def why_not_replayable(model: Model) -> str:
-    """Why the growth of a model cannot be recorded for other designs, or ""."""
-    anything = [e.title for e in model.effects if e.effect.writes_anything]
-    if anything:
-        return f"{anything[0]} may read and write anything"
-    if model.scene.founders.colony is not None:
-        return "its first cells name their colonies, so that these do not start alike"
-    for e in model.effects:
-        for f in e.declares():
-            if f.scope != CELL and e.place in model.recorded:
-                for mover in model.effects:
-                    used = f.name in (*mover.reads(), *mover.writes())
-                    if used and {*mover.writes()} & {*BUILT_IN}:
-                        return (
-                            f"{mover.title} acts on growth or motion and needs {f.name!r}, which is"
-                            " no quantity of cells"
-                        )
-                return (
-                    f"{e.effect.title} acts on growth or motion by {f.name!r}, which is no quantity"
-                    " of cells"
-                )
-    if not model.following:
-        return "every effect acts on growth or motion"
-    for path, tensor in (x for k in model.recorded for x in parameters(model.scene.effects[k])):
-        if tensor.dim() == 1:
-            return f"{path} differs between colonies and acts on their growth"
-        if tracked(tensor):
-            return f"a derivative by {path} is wanted, which recorded growth does not carry"
-    return ""
 
 
 @one_torch_thread()

@@ -19,18 +19,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchfilm.effect import BoundEffect
+from torchfilm.cpu_parts import OnCpu, Part
 from torchfilm.loop import advance
 from torchfilm.model import Model, advanced, bind
 from torchfilm.scene import Scene
 from torchfilm.state import CELL, PER_CELL, Births, State
-from torchfilm.together import Together
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import unchanged
 from torchfilm.tools.ragged import expand_ranges, offsets
 from torchfilm.tools.threads import after_fork, one_torch_thread
 from torchfilm.tools.warn_once import once
-from torchfilm.turns import Turns
 
 FIRST = -1  # the part of what happens before all effects
 
@@ -298,7 +296,7 @@ class Replay(metaclass=checks.KnownKeywords):
             state = self._with_failures(state, number)
         return advanced(state, self.dt)
 
-    def _follow(self, effect: BoundEffect | Turns | Together, state: State) -> State:
+    def _follow(self, effect: Part | OnCpu, state: State) -> State:
         """The state after an effect that only follows. Raises TypeError where it changes what
         growth uses, and so should not have been left out of the recording."""
         after = effect.run_step(state, self.dt)

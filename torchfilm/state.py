@@ -369,15 +369,14 @@ class State:
     def to(self, device: str | torch.device) -> State:
         """The same state on another device."""
         device = checks.device(device)
-        move = {name: getattr(self, name).to(device) for name in (*PER_CELL, *PER_COLONY)}
-        layout = None if self.layout is None else self.layout.to(device)
+        return self.moved(lambda part: part.to(device)).replace(births=(), ended=(), reports={})
+
+    def moved(self, move: Callable[[Any], Any]) -> State:
+        """The state with each tensor, and its layout, as a function returns it."""
         return self.replace(
-            **move,
-            fields={n: v.to(device) for n, v in self.fields.items()},
-            layout=layout,
-            births=(),
-            ended=(),
-            reports={},
+            **{name: move(getattr(self, name)) for name in (*PER_CELL, *PER_COLONY)},
+            fields={n: move(v) for n, v in self.fields.items()},
+            layout=None if self.layout is None else move(self.layout),
         )
 
     def uniform(self, rows: Tensor, purpose: str) -> Tensor:

@@ -1,13 +1,14 @@
-"""Measures steps of the same states by compiled kernels on the CPU and by torch on a GPU.
+"""Measures steps of the same states on the CPU and on a GPU, there by kernels and by torch.
 
     python experiments/benchmarks/gpu.py                        # all cases, some minutes
     python experiments/benchmarks/gpu.py --case "64 x 100"
-    python experiments/benchmarks/gpu.py --device cpu --case "1 x 1000"   # by torch, contacts only
+    python experiments/benchmarks/gpu.py --device cpu --case "1 x 1000"   # kernels and torch
 
-Colonies grow on the CPU to the given number of cells each. Then both take the same steps from
-there, and the table gives the least time of a step. Contacts are those of free growth, one-sided,
-2-D, float32; the other cases are ready-made scenes. The script appends each case to a JSON file
-with its machine, versions and commit.
+Colonies grow on the CPU to the given number of cells each. Then three take the same steps from
+there: kernels, for a state on the CPU; the same for one on the GPU, which is copied to and fro; and
+torch on the GPU. The table gives the least time of a step. Contacts are those of free growth,
+one-sided, 2-D, float32; the other cases are ready-made scenes. The script appends each case to a
+JSON file with its machine, versions and commit.
 """
 
 from __future__ import annotations
@@ -33,15 +34,12 @@ CASES = {
 
 
 def scene_of(name: str | None, backend: str | None) -> tf.Scene:
-    """Returns a scene whose contacts are computed by a backend."""
-    if name is not None:
-        scene = tf.scenes.build(name)
-        by = lambda e: replace(e, backend=backend) if isinstance(e, tf.Mechanics) else e
-        return scene.replace(*(by(e) for e in scene.effects))
-    return tf.Scene(
-        tf.Growth(rate=1.0, law="length"), tf.Division(length=tf.Uniform(3.5, 4.0)),
-        tf.Mechanics(dim=2, backend=backend), dim=2, dt=0.025,
-    )  # fmt: skip
+    """Returns a scene all of whose effects are computed by a backend."""
+    growth = tf.Growth(rate=1.0, law="length"), tf.Division(length=tf.Uniform(3.5, 4.0))
+    free = tf.Scene(*growth, tf.Mechanics(dim=2), dim=2, dt=0.025)
+    scene = free if name is None else tf.scenes.build(name)
+    by = lambda e: replace(e, backend=backend) if hasattr(e, "backend") else e
+    return scene.replace(*(by(e) for e in scene.effects))
 
 
 def timed(model: tf.Model, state: tf.State) -> tuple[float, int]:
@@ -64,11 +62,13 @@ def measure(case: str, device: str) -> dict:
     scene = scene_of(name, None)
     *_, state = tf.simulate(scene, colonies=colonies, cells=cells, seed=1)
     kernels, _ = timed(scene.bind(colonies, seed=1), state)
-    there = scene_of(name, "torch" if device == "cpu" else None)
-    by_torch, iterations = timed(there.bind(colonies, seed=1, device=device), state.to(device))
+    there = state.to(device)
+    copied, _ = timed(scene.bind(colonies, seed=1, device=device), there)
+    torchs = scene_of(name, "torch").bind(colonies, seed=1, device=device)
+    by_torch, iterations = timed(torchs, there)
     return {
-        "case": case, "cells": state.cells, "device": device,
-        "kernels_ms": round(kernels, 1), "torch_ms": round(by_torch, 1),
+        "case": case, "cells": state.cells, "device": device, "kernels_ms": round(kernels, 1),
+        "copied_ms": round(copied, 1), "torch_ms": round(by_torch, 1),
         "iterations_per_step": round(iterations / STEPS, 1),
     }  # fmt: skip
 
@@ -83,12 +83,13 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_grad_enabled(False)
     records = json.loads(options.out.read_text()) if options.out.exists() else []
-    print(f"{'case':26} {'cells':>8} {'kernels, CPU':>14} {'torch, ' + options.device:>14}")
+    there = options.device
+    print(f"{'case':26} {'cells':>8} {'cpu':>14} {there + ', kernels':>14} {there + ', torch':>14}")
     for case in options.case:
         found = measure(case, options.device)
         print(
             f"{case:26} {found['cells']:8} {found['kernels_ms']:11.1f} ms"
-            f" {found['torch_ms']:11.1f} ms"
+            f" {found['copied_ms']:11.1f} ms {found['torch_ms']:11.1f} ms"
         )
         records.append(machine() | found)
         options.out.write_text(json.dumps(records, indent=1) + "\n")

@@ -120,10 +120,11 @@ class Circuit(Effect):
         by_type: dict[int | str, Part] = (
             dict(rates.items()) if isinstance(rates, Mapping) else {EVERY: rates}
         )
+        parameters = checks.keywords(parameters, "parameters")
         names = names_of(species)
         others = shared_fields(shared)
         check_species(names, others)
-        check_rates(by_type, isinstance(rates, Mapping))
+        check_rates(by_type, EVERY not in by_type)
         check_initial(initial, names)
         check_constants(parameters, [f.name for f in dataclasses.fields(self)])
         check_method(method, steps, by_type)

@@ -70,8 +70,8 @@ class Mechanics(Effect):
     residual relative to that at rest, default 0.05 or, where α γ is below 0.1, 0.05 · (α γ/0.1)^¼.
     max_iterations: CG iterations a solve. max_elongation: µm; a colony whose cells would grow more
     in a step takes sub-steps. adhesion: cells stick together, see `tf.Adhesion`; several kinds add
-    up. Only one-sided contacts have it. backend: "compiled" kernels or "torch". Default: compiled
-    where the device is the CPU and no gradient is required.
+    up. Only one-sided contacts have it. backend: "compiled" kernels, on the CPU, or "torch".
+    Default: compiled where no gradient is required.
     """
 
     walls: Sequence[Wall] = ()

@@ -80,8 +80,8 @@ class Medium(Effect):
     "series". splitting: of these, "strang", half of transport before the cells and half after, or
     "lie", cells and then transport. Strang makes the error of the signal many times smaller, for
     one more transport per step.
-    backend: "compiled" kernels or "torch" for transport. Default: compiled where the device is the
-    CPU and Numba is there; gradients always by torch.
+    backend: "compiled" kernels, on the CPU, or "torch" for transport. Default: compiled where Numba
+    is there; gradients always by torch.
     """
 
     signals: Mapping[str, Signal]
@@ -127,7 +127,7 @@ class Medium(Effect):
         backend: str | None = None,
         **signals: Signal,
     ):
-        _check_signals(signals)
+        signals = _named(signals)
         low, high, voxel = checked_box(box, spacing, depth, height)
         _check_medium(boundary, outside, grows, margin, method, steps, splitting, obstacles)
         if exchange is not None:
@@ -384,7 +384,9 @@ def _stays_0(name: str) -> str:
     )
 
 
-def _check_signals(signals: Mapping[str, Any]) -> None:
+def _named(signals: Mapping[str, Any]) -> dict[str, Any]:
+    """The signals by name, checked."""
+    signals = checks.keywords(signals, "signals")
     if not signals:
         raise checks.InputError(
             "Medium() has no signal: name at least one, such as ahl=tf.Signal(diffusion=10.0)."
@@ -397,6 +399,7 @@ def _check_signals(signals: Mapping[str, Any]) -> None:
                 "a Signal",
                 f"Write {name}=tf.Signal(diffusion=…), or check the spelling of an option.",
             )
+    return signals
 
 
 def _still(boundary: BoundaryConditions | None) -> BoundaryConditions | None:

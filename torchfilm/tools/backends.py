@@ -17,12 +17,16 @@ def check_backend(owner: str, backend: str | None) -> None:
 
 
 def why_torch(owner: str, backend: str | None, device: torch.device) -> str:
-    """Why torch computes on a device, or "" where kernels do. Raises InputError where "compiled" is
-    asked for and cannot be."""
+    """Why torch computes what is bound to a device, or "" where kernels do. Raises InputError where
+    "compiled" is asked for and cannot be. On a GPU torch does, but what is bound to it may have a
+    twin on the CPU (`torchfilm.cpu_parts`)."""
     if backend == "torch":
         return "backend='torch'"
-    off_cpu = f"the device is {device.type}, and kernels are for the CPU"
-    why = unavailable() if device.type == "cpu" else off_cpu
+    why = unavailable()
     if backend == "compiled" and why:
         raise checks.InputError(f"{owner}.backend = 'compiled', but {why}. Leave backend out.")
-    return why
+    return why or (
+        ""
+        if device.type == "cpu"
+        else f"the state is on {device.type}, and kernels are for the CPU"
+    )

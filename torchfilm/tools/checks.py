@@ -129,6 +129,15 @@ def check_call(
         ) from None
 
 
+def keywords(given: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Keywords that a description keeps as one mapping; under the `name` of this,
+    `dataclasses.replace` gives those that it has."""
+    kept = given.get(name)
+    if not isinstance(kept, Mapping):
+        return {**given}
+    return {**kept, **{n: x for n, x in given.items() if n != name}}
+
+
 def _named_only(found: Mapping[str, Any], last: object) -> str:
     """What to write in place of a last argument that has no name but needs one."""
     named = [n for n, kind in found.items() if kind is inspect.Parameter.KEYWORD_ONLY]
