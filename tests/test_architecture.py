@@ -35,7 +35,7 @@ ROOMS = {
     # compiled loops over arrays: they know neither torch nor the rest
     "kernels": Room(0, ("torchfilm.kernels",)),
     "tensors": Room(1, ("torchfilm.physics", "torchfilm.signals", "torchfilm.circuits")),
-    "state": Room(2, ("torchfilm.state",)),
+    "state": Room(2, ("torchfilm.state", "torchfilm.state_colonies")),
     # what an effect is, how values are given, resolved and printed, what rules see
     "protocol": Room(
         3,

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -74,9 +75,14 @@ class Model:
 
     # --- running -------------------------------------------------------------------------
 
-    def start(self) -> State:
-        """The first state: founders, all fields at their first values, grids laid."""
-        state = self._laid()
+    def start(self, seed: int | None = None) -> State:
+        """The first state: founders, all fields at their first values, grids laid. seed: of what is
+        drawn; by default that of the model."""
+        begin = self._begin
+        if seed is not None:
+            checks.integer("seed", seed, least=0, most=2**63 - 1)
+            begin = replace(begin, seed=seed)
+        state = self._laid(begin)
         for effect in self.effects:
             state = effect.ready(state)
         return state
@@ -129,8 +135,7 @@ class Model:
         on_cpu = self.batch.device.type == "cpu"
         return self.twins is not None or (on_cpu and any(e.by_kernels for e in self.effects))
 
-    def _laid(self) -> State:
-        start = self._begin
+    def _laid(self, start: FirstCells) -> State:
         state = start.cells.state(start.colonies, start.seed, self.batch.device, self.batch.dtype)
         state = state.replace(space=self._space)
         if start.streams is not None:
@@ -162,7 +167,7 @@ class Model:
         state: of a run that is to be continued, or None for the first state. Returns the state
         tried on, made ready.
         """
-        tried = self._laid() if state is None else state
+        tried = self._laid(self._begin) if state is None else state
         for effect in self.effects:
             tried = effect.trace(tried)
         for effect in self.effects:  # now that it is known what rules write

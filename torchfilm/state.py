@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -11,14 +11,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchfilm import state_colonies
 from torchfilm.physics import capsule
 from torchfilm.physics.space import PeriodicSpace
 from torchfilm.signals.layout import Contact, Layout, Signals
+from torchfilm.state_colonies import CELL, COLONY, GRID, PER_COLONY
 from torchfilm.tools import checks, displays, random, row_checks, tangents
-from torchfilm.tools.ragged import Groups, offsets
+from torchfilm.tools.ragged import Groups
 from torchfilm.tools.read_only import read_only
 
-CELL, COLONY, GRID = "cell", "colony", "grid"
 FATES = ("divided", "removed", "left", "failed", "lysed")  # why cells leave a state
 # Signals stand among the fields under "out.NAME", beside what cells hold under the same name.
 OUTSIDE = "out."
@@ -344,27 +345,28 @@ class State:
         """Some colonies of the batch, by their places, in the order given. Each goes on as it would
         have in the whole."""
         places = row_checks.checked_places("colonies", colonies, self.colonies, self.device)
-        start = self.groups.begin
-        counts = self.counts.index_select(0, places)
-        owner = torch.repeat_interleave(torch.arange(places.numel(), device=self.device), counts)
-        begin = offsets(counts)[:-1].index_select(0, owner)
-        within = torch.arange(owner.numel(), device=self.device) - begin
-        taken = self.take(start.index_select(0, places).index_select(0, owner) + within)
-        layout, nodes = (None, None) if self.layout is None else self.layout.take(places)
-        kept = {CELL: None, COLONY: places, GRID: nodes}
-        fields = {
-            n: v if (index := kept[self.declared[n].scope]) is None else v.index_select(0, index)
-            for n, v in taken.fields.items()
-        }
-        return taken.replace(
-            colony=owner,
-            fields=fields,
-            layout=layout,
-            births=(),
-            ended=(),
-            reports={},
-            **{name: getattr(self, name).index_select(0, places) for name in PER_COLONY},
-        )
+        return state_colonies.selected(self, places)
+
+    def put(
+        self, colonies: Tensor | list[int], other: State, taken: Tensor | list[int] | None = None
+    ) -> State:
+        """The state with others in place of some colonies: new ones, as after an episode, or
+        copies, as in a particle filter.
+
+        colonies: which, by their places. other: a state of the same scene, such as `model.start()`
+        or this one. taken: which of its colonies, by place, one for each of `colonies`; one may be
+        taken often. Default: all, in order. The place keeps its colony_id, and with it parameters
+        per colony; its stream of random numbers; and the batch its seed, step and time. Raises
+        InputError for a state of another scene.
+        """
+        places = row_checks.checked_places("colonies", colonies, self.colonies, self.device)
+        return state_colonies.put(self, places, other, taken)
+
+    def detach(self, keep: Collection[str] = ()) -> State:
+        """The same state without the derivatives that it carries, as where a backward pass is cut
+        off. keep: fields that keep theirs, such as growth_rate, a column of the cells by which all
+        derivatives by Growth.rate go."""
+        return state_colonies.detached(self, keep)
 
     def to(self, device: str | torch.device) -> State:
         """The same state on another device."""
@@ -422,7 +424,6 @@ class State:
 
 
 PER_CELL = ("colony", "uid", "parent", "position", "axis", "length", "radius")
-PER_COLONY = ("colony_id", "stream", "next_uid")
 # What is worked out once for a state, and from which of its parts.
 DERIVED = {
     "groups": ("colony", "colony_id"),

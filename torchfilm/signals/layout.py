@@ -217,6 +217,12 @@ class Layout:
         """The same medium on another grid."""
         return self if grid is self.grid else replace(self, grid=grid)
 
+    def joined(self, other: Layout) -> Layout:
+        """The grids of both, one after the other, in the space of this one."""
+        origin = torch.cat([self.grid.origin, other.grid.origin])
+        shape = torch.cat([self.grid.shape, other.grid.shape])
+        return self.on(Grid(origin, shape, self.grid.spacing))
+
     def take(self, colonies: Tensor) -> tuple[Layout, Tensor]:
         """The layout of some colonies (b,), and the indices (nodes,) of their voxels here."""
         grid = Grid(

@@ -49,8 +49,10 @@ def check_mask(name: str, mask: Any, count: int) -> None:
         raise checks.input_error(name, mask, rule, "Such as state.length > 5.0.")
 
 
-def checked_places(name: str, given: Any, count: int, device: torch.device) -> Tensor:
-    """Different places from 0 to count − 1, at least one, (M,) int64."""
+def checked_places(
+    name: str, given: Any, count: int, device: torch.device, *, distinct: bool = True
+) -> Tensor:
+    """Places from 0 to count − 1, at least one, (M,) int64. distinct: none comes twice."""
     try:
         places = torch.as_tensor(given, device=device).reshape(-1)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -63,7 +65,7 @@ def checked_places(name: str, given: Any, count: int, device: torch.device) -> T
     if places.numel() == 0 or bool((places < 0).any()) or bool((places >= count).any()):
         rule = f"places from 0 to {count - 1}, at least one"
         raise checks.input_error(name, places.tolist(), rule)
-    if torch.unique(places).numel() != places.numel():
+    if distinct and torch.unique(places).numel() != places.numel():
         raise checks.input_error(name, places.tolist(), "different places")
     return places
 

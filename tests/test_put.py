@@ -1,0 +1,156 @@
+"""Colonies put in the place of others: they go on as where they came from, and the others as if
+nothing had happened."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers import step
+from mock_cuda import pretended_cuda  # noqa: F401
+from test_devices import columns
+
+import torchfilm as tf
+
+RATES = [1.0, 1.3, 1.6]
+
+
+def scene_of(*more: tf.Effect) -> tf.Scene:
+    return tf.Scene(
+        tf.Growth(rate=RATES), tf.Division(length=tf.Uniform(3.0, 3.5)), tf.Mechanics(dim=2),
+        *more, dt=0.05, dim=2,
+    )  # fmt: skip
+
+
+def signalling() -> tf.Scene:
+    circuit = tf.Circuit(
+        lambda u, s, p, cell: ({"m": 1.0 - u.m}, {"a": cell.volume * (0.1 - s.a)}), species=("m",)
+    )
+    medium = tf.Medium(a=tf.Signal(100.0), box=((-6, -6), (6, 6)), spacing=2.0, depth=1.0,
+                       outside="grow")  # fmt: skip
+    return scene_of(circuit, medium)
+
+
+def reservoirs() -> tf.Scene:
+    """A field for each colony: what the reservoir has taken."""
+    circuit = tf.Circuit(lambda u, s, p, cell: ({"m": -u.m}, {"a": 0.1 * cell.volume}),
+                         species=("m",))  # fmt: skip
+    medium = tf.Medium(a=tf.Signal(100.0), box=((-4, -4), (4, 4)), spacing=2.0, depth=1.0,
+                       outside="reservoir")  # fmt: skip
+    return scene_of(circuit, medium)
+
+
+def run(scene: tf.Scene, state: tf.State, steps: int) -> tf.State:
+    for _ in range(steps):
+        state = step(scene, state, scene.dt)
+    assert not tf.failures(state)
+    return state
+
+
+def check_same(one: tf.State, other: tf.State) -> None:
+    assert one.colony_id.tolist() == other.colony_id.tolist()
+    assert one.next_uid.tolist() == other.next_uid.tolist()
+    right = columns(other)
+    for name, value in columns(one).items():
+        assert torch.equal(value, right[name]), name
+
+
+@pytest.mark.parametrize("make", [scene_of, signalling, reservoirs])
+@torch.no_grad()
+def test_a_colony_that_is_put_goes_on_as_where_it_was(make):
+    scene = make()
+    model = scene.bind(3, seed=1)
+    grown = run(scene, model.start(), 30)
+    # the same colony alone, at the time of the batch
+    fresh = scene.bind(3, seed=9).start().replace(step=grown.step, time=grown.time, seed=1)
+    mixed = grown.put([1], fresh, taken=[1])
+    assert mixed.counts.tolist() == [*grown.counts[:1].tolist(), 1, *grown.counts[2:].tolist()]
+    after = run(scene, mixed, 30)
+    check_same(after.select([0, 2]), run(scene, grown, 30).select([0, 2]))
+    check_same(after.select([1]), run(scene, fresh, 30).select([1]))
+    assert int(after.counts[1]) > 1
+
+
+@torch.no_grad()
+def test_copies_go_on_by_the_random_numbers_and_parameters_of_their_places():
+    scene = signalling()
+    grown = run(scene, scene.bind(3, seed=1).start(), 30)
+    copies = grown.put([0, 1, 2], grown, taken=[2, 2, 2])
+    assert copies.colony_id.tolist() == copies.stream.tolist() == [0, 1, 2]
+    a, b, c = (copies.select([k]) for k in range(3))
+    assert torch.equal(a.position, c.position) and torch.equal(a.uid, b.uid)
+    assert torch.equal(a.signals["a"], c.signals["a"])
+    # a growth rate is a column of the cells; daughters draw their thresholds anew
+    after = run(scene, copies, 40)
+    a, b, c = (after.select([k]) for k in range(3))
+    assert not torch.equal(a.division_threshold, b.division_threshold)
+    check_same(c, run(scene, grown, 40).select([2]))
+
+
+def test_places_may_be_tensors_ranges_and_few_of_many():
+    scene = scene_of()
+    model = scene.bind(3, seed=1)
+    with torch.no_grad():
+        grown = run(scene, model.start(), 30)
+    for places in (torch.tensor([2, 0]), range(2, -1, -2), [2, 0]):
+        made = grown.put(places, model.start(seed=4), taken=[2, 0])
+        assert made.counts.tolist() == [1, int(grown.counts[1]), 1]
+    whole = grown.put([0, 1, 2], model.start(seed=4))
+    assert whole.counts.tolist() == [1, 1, 1] and whole.step == grown.step == 30
+    assert whole.seed == 1 and (whole.time, whole.births, whole.reports) == (grown.time, (), {})
+    assert not torch.equal(whole.division_threshold, model.start().division_threshold)
+    assert torch.equal(model.start(seed=1).division_threshold, model.start().division_threshold)
+
+
+def test_what_does_not_fit_is_refused():
+    scene = scene_of()
+    state, named = scene.bind(3).start(), signalling().bind(3).start()
+    double = scene.bind(3, dtype=torch.float64).start()
+    for error, given in (
+        (r"colonies = \[0, 0\].*different places", lambda: state.put([0, 0], state)),
+        (r"colonies = \[3\].*places from 0 to 2", lambda: state.put([3], state)),
+        (r"other = '3 colonies'.*1 colonies, one for each.*taken=", lambda: state.put([1], state)),
+        (r"taken = \[0, 1\].*1 places", lambda: state.put([1], state, taken=[0, 1])),
+        (r"taken = \[4\].*places from 0 to 2", lambda: state.put([1], state, taken=[4])),
+        (r"other = 3 is not allowed.*a State", lambda: state.put([1], 3)),
+        (r"other.dtype = torch.float64", lambda: state.put([0], double, taken=[0])),
+        (r"has the field 'circuit_volume', the other", lambda: named.put([0], state, taken=[0])),
+    ):  # fmt: skip
+        with pytest.raises(tf.InputError, match=error):
+            given()
+    other = tf.Medium(a=tf.Signal(100.0), box=((-6, -6), (6, 6)), spacing=3.0, depth=1.0,
+                      outside="grow")  # fmt: skip
+    effects = [other if isinstance(e, tf.Medium) else e for e in signalling().effects]
+    strange = signalling().replace(*effects).bind(3).start()
+    with pytest.raises(tf.InputError, match=r"spacing, periodic axes and height = \(\(3.0, 3.0"):
+        signalling().bind(3).start().put([0], strange, taken=[0])
+
+
+def test_derivatives_pass_and_detach_cuts_them():
+    rate = torch.tensor([1.0, 1.3, 1.6], dtype=torch.float64, requires_grad=True)
+    scene = tf.Scene(tf.Growth(rate=rate, law="length"), dim=2, dt=0.1)
+    model = scene.bind(3, dtype=torch.float64)
+    grown = run(scene, model.start(), 5)
+    mixed = grown.put([0, 1], grown, taken=[2, 1])
+    (slope,) = torch.autograd.grad(mixed.length.sum(), rate, retain_graph=True)
+    length = 0.5 * grown.length.detach()
+    assert torch.allclose(slope, torch.stack([0 * length[0], length[1], 2 * length[2]]))
+    cut = grown.detach()
+    assert grown.length.requires_grad and not cut.length.requires_grad
+    assert torch.equal(cut.length, grown.length) and cut.step == 5
+    assert not run(scene, cut, 1).length.requires_grad  # growth rates are columns, too
+    last = run(scene, grown.detach(keep=["growth_rate"]), 1)
+    (slope,) = torch.autograd.grad(last.length.sum(), rate)
+    assert torch.allclose(slope, 0.1 * last.length.detach())
+    with pytest.raises(tf.InputError, match=r"keep = 'rate' is not allowed.*growth_rate"):
+        grown.detach(keep=["rate"])
+
+
+def test_colonies_are_put_on_a_gpu(pretended_cuda):  # noqa: F811
+    scene = signalling()
+    model = scene.bind(3, device="cuda")
+    with torch.no_grad():
+        grown = run(scene, model.start(), 20)
+        made = run(scene, grown.put([1], model.start(seed=2), taken=[1]), 5)
+    assert all(x.device.type == "cuda" for x in columns(made).values())
+    with pytest.raises(tf.InputError, match=r"other.device = device\(type='cpu'\)"):
+        grown.put([1], scene.bind(3).start(), taken=[1])

@@ -1,0 +1,126 @@
+"""Colonies of a state as wholes: some of them taken out, or put in the place of others."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchfilm.tools import checks, row_checks
+from torchfilm.tools.ragged import offsets
+
+if TYPE_CHECKING:
+    from torchfilm.state import State
+
+CELL, COLONY, GRID = "cell", "colony", "grid"
+PER_COLONY = ("colony_id", "stream", "next_uid")
+
+
+def selected(state: State, places: Tensor) -> State:
+    """The colonies at these places (b,) int64, in this order; one may come more than once."""
+    counts = state.counts.index_select(0, places)
+    owner = torch.repeat_interleave(torch.arange(places.numel(), device=state.device), counts)
+    begin = offsets(counts)[:-1].index_select(0, owner)
+    within = torch.arange(owner.numel(), device=state.device) - begin
+    taken = state.take(state.groups.begin.index_select(0, places).index_select(0, owner) + within)
+    layout, nodes = (None, None) if state.layout is None else state.layout.take(places)
+    kept = {CELL: None, COLONY: places, GRID: nodes}
+    fields = {
+        n: v if (index := kept[state.declared[n].scope]) is None else v.index_select(0, index)
+        for n, v in taken.fields.items()
+    }
+    return taken.replace(
+        colony=owner,
+        fields=fields,
+        layout=layout,
+        births=(),
+        ended=(),
+        reports={},
+        **{name: getattr(state, name).index_select(0, places) for name in PER_COLONY},
+    )
+
+
+def detached(state: State, keep: Collection[str]) -> State:
+    """The state without derivatives, but for those of the fields in `keep`."""
+    for name in [keep] if isinstance(keep, str) else keep:
+        checks.choice("keep", name, [*state.fields])
+    kept = {n: x for n, x in state.fields.items() if n in keep}
+    cut = state.moved(lambda part: part.detach() if isinstance(part, Tensor) else part)
+    return cut.replace(births=(), ended=(), reports={}, fields={**cut.fields, **kept})
+
+
+def put(state: State, places: Tensor, other: State, taken: object) -> State:
+    """The state with the colonies `taken` (b,) of another one at these places (b,) int64."""
+    check_alike(state, other)
+    rows = checked_taken(taken, places, other.colonies)
+    order = torch.arange(state.colonies, device=state.device)
+    order = order.index_copy(0, places, state.colonies + rows)
+    made = selected(_side_by_side(state, other), order)
+    return made.replace(colony_id=state.colony_id, stream=state.stream)
+
+
+def _side_by_side(state: State, other: State) -> State:
+    """The colonies of both. Those of the second lie at places after those of the first."""
+    joined = lambda name: torch.cat([getattr(state, name), getattr(other, name)])
+    owner = torch.cat([state.colony, state.colonies + other.colony])
+    columns = [n for n in state.cell_columns() if n not in state.fields and n != "colony"]
+    layout = state.layout
+    if layout is not None and other.layout is not None:
+        layout = layout.joined(other.layout)
+    return state.replace(
+        colony=owner,
+        fields={n: torch.cat([x, other.fields[n]]) for n, x in state.fields.items()},
+        layout=layout,
+        **{name: joined(name) for name in (*columns, *PER_COLONY)},
+    )
+
+
+def check_alike(state: State, other: State) -> None:
+    """Raises InputError for a state whose colonies cannot stand beside those of a first one."""
+    if not isinstance(other, type(state)):
+        raise checks.input_error("other", other, "a State, such as model.start()")
+    for what in ("dim", "dtype", "device", "space"):
+        mine, theirs = getattr(state, what), getattr(other, what)
+        if mine != theirs:
+            raise checks.input_error(f"other.{what}", theirs, f"{mine}, as this state has")
+    names = sorted(state.fields.keys() ^ other.fields.keys())
+    hint = "Take a state of the same scene, such as model.start()."
+    if names:
+        has, lacks = ("this", "the other") if names[0] in state.fields else ("the other", "this")
+        found = f"of another scene: {has} state has the field {names[0]!r}, {lacks} has not"
+        raise checks.InputError(f"other is {found}. {hint}")
+    for name, value in state.fields.items():
+        theirs, scope = other.fields[name], state.declared[name].scope
+        if value.dtype != theirs.dtype or value.shape[1:] != theirs.shape[1:]:
+            raise checks.input_error(
+                f"other.fields[{name!r}]", f"{tuple(theirs.shape)}, {theirs.dtype}",
+                f"of rows {tuple(value.shape[1:])} and {value.dtype}, as in this state", hint,
+            )  # fmt: skip
+        if other.declared[name].scope != scope:
+            raise checks.input_error(f"scope of {name!r}", other.declared[name].scope, scope, hint)
+    if state.layout is not None and other.layout is not None:
+        mine, theirs = (
+            (x.grid.spacing, x.periodic, x.height) for x in (state.layout, other.layout)
+        )
+        if mine != theirs:
+            told = "other's spacing, periodic axes and height"
+            raise checks.input_error(told, theirs, f"{mine}, as this state's medium has", hint)
+
+
+def checked_taken(given: object, places: Tensor, count: int) -> Tensor:
+    """Which colonies of another state, of `count`, go to these places; by default the first ones
+    in order. Raises InputError where there are not as many."""
+    if given is None:
+        rule = f"{places.numel()} colonies, one for each place"
+        if count != places.numel():
+            raise checks.input_error(
+                "other", f"{count} colonies", rule, "Say which by taken=…, such as taken=[0, 0]."
+            )
+        return torch.arange(count, device=places.device)
+    taken = row_checks.checked_places("taken", given, count, places.device, distinct=False)
+    if taken.numel() != places.numel():
+        rule = f"{places.numel()} places, one for each of `colonies`"
+        raise checks.input_error("taken", taken.tolist(), rule)
+    return taken
