@@ -268,3 +268,18 @@ def test_constants_are_needed_where_the_circuit_runs():
     scene = tf.Scene(tf.Circuit({1: made}, species=("m",), k={1: 1.0}), founders=TYPES)
     state = grown(scene, 4)
     assert state.m.tolist() == pytest.approx([0.0, 0.1])
+
+
+@pytest.mark.parametrize("transform", [torch.func.grad, torch.func.vmap])
+def test_values_in_a_transform_of_torch_func_are_refused(transform):
+    """Whatever they are for; torch's own words would not tell why."""
+    for make in (
+        lambda x: tf.Growth(rate=x),
+        lambda x: tf.Mechanics(dim=2, viscosity=x),
+        lambda x: tf.Circuit(lambda u, s, p, cell: {"m": p.k - u.m}, species=("m",), k=x),
+        lambda x: tf.Signal(diffusion=x),
+        lambda x: tf.Growth(rate={0: 1.0, 1: x}),
+        lambda x: tf.Division(length=tf.Uniform(x, 4.0)),
+    ):
+        with pytest.raises(tf.InputError, match=r"in a transform of torch.func.*tf.tangents"):
+            transform(make)(torch.tensor([2.0, 3.0]))

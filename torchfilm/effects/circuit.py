@@ -45,6 +45,7 @@ from torchfilm.resolver import Values
 from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.backends import check_backend
+from torchfilm.tools.parts import keywords
 from torchfilm.values import COLONY, CONCENTRATION, CONSTANT, Rule, Value, checked
 
 Part = run.RateFunction | Sequence[Reaction | Sequence[Reaction]]
@@ -120,7 +121,7 @@ class Circuit(Effect):
         by_type: dict[int | str, Part] = (
             dict(rates.items()) if isinstance(rates, Mapping) else {EVERY: rates}
         )
-        parameters = checks.keywords(parameters, "parameters")
+        parameters = keywords(parameters, "parameters")
         names = names_of(species)
         others = shared_fields(shared)
         check_species(names, others)

@@ -37,6 +37,7 @@ from torchfilm.signals.transport_series import MOST
 from torchfilm.state import COLONY, GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import check_backend, why_torch
+from torchfilm.tools.parts import keywords
 from torchfilm.values import CONCENTRATION
 
 OUTSIDE_CELLS = ("error", "grow", "reservoir")
@@ -386,7 +387,7 @@ def _stays_0(name: str) -> str:
 
 def _named(signals: Mapping[str, Any]) -> dict[str, Any]:
     """The signals by name, checked."""
-    signals = checks.keywords(signals, "signals")
+    signals = keywords(signals, "signals")
     if not signals:
         raise checks.InputError(
             "Medium() has no signal: name at least one, such as ahl=tf.Signal(diffusion=10.0)."

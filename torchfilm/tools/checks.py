@@ -129,15 +129,6 @@ def check_call(
         ) from None
 
 
-def keywords(given: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Keywords that a description keeps as one mapping; under the `name` of this,
-    `dataclasses.replace` gives those that it has."""
-    kept = given.get(name)
-    if not isinstance(kept, Mapping):
-        return {**given}
-    return {**kept, **{n: x for n, x in given.items() if n != name}}
-
-
 def _named_only(found: Mapping[str, Any], last: object) -> str:
     """What to write in place of a last argument that has no name but needs one."""
     named = [n for n, kind in found.items() if kind is inspect.Parameter.KEYWORD_ONLY]
@@ -273,6 +264,9 @@ def value(
         given = torch.as_tensor(given)
     if not isinstance(given, Tensor):
         return number(name, given, above=above, least=least, most=most, hint=hint)
+    if torch._C._functorch.is_functorch_wrapped_tensor(given):
+        instead = "torch.autograd.grad, tf.tangents, or one value for each colony in place of vmap"
+        raise input_error(name, "in a transform of torch.func", "a plain tensor", f"Use {instead}.")
     if given.dim() > 1 or not (
         given.is_floating_point() or given.dtype in (torch.int32, torch.int64)
     ):

@@ -31,3 +31,12 @@ def mapped(part: Any, change: Callable[[str, Any], Any], path: str = "") -> Any:
         copy.__dict__.update({**vars(part), **changed})  # past __init__: they have been checked
         return copy
     return part
+
+
+def keywords(given: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Keywords that a description keeps as one mapping; under the `name` of this,
+    `dataclasses.replace` gives those that it has."""
+    kept = given.get(name)
+    if not isinstance(kept, Mapping):
+        return {**given}
+    return {**kept, **{n: x for n, x in given.items() if n != name}}
