@@ -3,7 +3,9 @@ the GPU. The GPU is a pretended one; `tests/test_cuda.py` runs the same on a rea
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -223,3 +225,140 @@ def test_a_replay_has_the_bits_of_the_cpu(pretended_cuda):  # noqa: F811
             state = replay.step(state)
         found.append(state)
     check_same(*found)
+
+
+BOX = {"box": ((-20.0, -20.0), (20.0, 20.0)), "spacing": 4.0, "depth": 1.0}
+
+
+def test_reports_of_exchange_in_turns_are_on_the_gpu(pretended_cuda):  # noqa: F811
+    """A run looks at how they swing; groups of cells are among them."""
+    scene = colony(
+        tf.Circuit(lambda u, s, p, cell: ({"m": 1.0 - u.m}, {"n": -0.1 * s.n * cell.volume}),
+                   species=("m",)),
+        tf.Medium(n=tf.Signal(50.0, initial=5.0), exchange="turns", steps=2, **BOX),
+    )  # fmt: skip
+    *_, state = tf.simulate(scene, until=0.2, colonies=2, device="cuda")
+    exchanged = state.reports["circuit"].exchanged
+    assert exchanged.groups.owner.device.type == exchanged.pool.device.type == "cuda"
+    assert exchanged.groups.sum(exchanged.pool.unsqueeze(1)).device.type == "cuda"
+
+
+@pytest.mark.parametrize("where", ["source", "decay", "flow"])
+def test_derivatives_by_what_a_function_of_positions_holds_pass(pretended_cuda, where):  # noqa: F811
+    slope = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
+    law = lambda x: slope.to(x.device) * (1.0 + 0.0 * x[:, 0])
+    if where == "flow":
+        law = lambda x: slope.to(x.device) * torch.ones_like(x)
+    signal = tf.Signal(50.0, initial=1.0, **{where: law})
+    model = colony(tf.Medium(a=signal, **BOX)).bind(2, device="cuda", dtype=torch.float64)
+    state = model.step(model.step(model.start()))
+    assert state.signals["a"].requires_grad
+    with torch.no_grad():
+        assert not model.step(state).signals["a"].requires_grad
+
+
+@pytest.mark.parametrize("where", ["source", "decay", "initial", "flow"])
+def test_functions_of_tensors_on_the_gpu_stay_there(pretended_cuda, where):  # noqa: F811
+    held = torch.tensor([0.5, 1.0, 0.0], dtype=torch.float64).to("cuda")
+    law = lambda x: (x * held).sum(1).abs()
+    if where == "flow":
+        law = lambda x: held.expand(x.shape)
+    medium = tf.Medium(a=tf.Signal(50.0, **{where: law}), **BOX)
+    model = colony(medium).bind(2, device="cuda")
+    assert "transport" in model.twins.kept and "mechanics" in by_kernels(model)
+    state = model.step(model.start())
+    assert state.signals["a"].device.type == "cuda"
+    with pytest.raises(tf.InputError, match=r"Medium.backend = 'compiled', but kernels are for"):
+        colony(replace(medium, backend="compiled")).bind(2, device="cuda")
+
+
+def test_schedules_are_no_functions_of_positions(pretended_cuda):  # noqa: F811
+    around = tf.BoundaryConditions(x=tf.Periodic(), y=tf.Periodic())
+    flow = tf.Schedule({0.0: (1.0, 0.0), 0.3: (40.0, 0.0)})
+    scene = colony(tf.Medium(a=tf.Signal(5.0, source=lambda x: 1.0 * (x[:, 0] > 0)), flow=flow,
+                             boundary=around, **BOX))  # fmt: skip
+    assert not scene.bind(2, device="cuda").twins.kept
+    check_same(run(scene, "cuda"), run(scene, "cpu"))
+
+
+def test_fields_that_are_declared_on_a_state_start_on_the_gpu(pretended_cuda):  # noqa: F811
+    scene = colony()
+    model = scene.bind(2, device="cuda")
+    first = lambda state, rows: 7.0 * torch.ones(rows.numel(), device="cuda")
+    tag = tf.Field("tag", "of daughters", at_division="reset", initial=first)
+    state = model.start().declare(tag)
+    for _ in range(12):
+        state = model.step(state)
+    assert state.cells > 2 and state.tag.tolist() == [7.0] * state.cells
+
+
+class Told(NamedTuple):
+    status: torch.Tensor
+    hint: str
+
+    def reason(self, place: int) -> str:
+        return "none"
+
+
+@dataclass(frozen=True)
+class Tells(tf.Effect):
+    title, stage = "tells", 5
+
+    def step(self, state, dt, values):
+        told = Told(torch.zeros_like(state.counts), "x")
+        return state.replace(reports={**state.reports, "tells": told})
+
+
+def test_reports_of_ones_own_stay_what_they_are(pretended_cuda):  # noqa: F811
+    *_, state = tf.simulate(colony(Tells()), until=0.1, colonies=2, device="cuda")
+    assert type(state.reports["tells"]) is Told and state.reports["tells"].hint == "x"
+
+
+class HiddenPlane(tf.Plane):
+    """A wall whose place hides in a tensor on the GPU."""
+
+    def surfaces(self, dim):
+        (surface,) = super().surfaces(dim)
+        moved = surface.offset + torch.zeros(()).to("cuda")
+        return [replace(surface, offset=moved)]
+
+
+def test_walls_of_tensors_on_the_gpu_stay_there(pretended_cuda):  # noqa: F811
+    walls = [HiddenPlane(y=-5.0, facing="+y")]
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(walls=walls, dim=2), dt=0.05, dim=2)
+    model = scene.bind(2, device="cuda")
+    assert model.twins is None  # nothing is left that is worth the way
+    assert model.step(model.start()).position.device.type == "cuda"
+
+
+def test_what_binding_warns_of_is_said_once(pretended_cuda):  # noqa: F811
+    box = {**BOX, "box": ((-20.0, 0.0), (20.0, 20.0))}
+    medium = tf.Medium(a=tf.Signal(50.0, source=1.0), outside="grow", **box)
+    scene = colony(medium, walls=[tf.Plane(y=0.0, facing="+y")])
+    with pytest.warns(UserWarning, match="the box grows through the wall") as said:
+        scene.bind(cells=tf.Cells([[0.0, 2.0]], [[1.0, 0.0]]), colonies=2, device="cuda")
+    assert len(said) == 1
+
+
+def test_what_happened_before_a_division_is_on_the_gpu(pretended_cuda):  # noqa: F811
+    scene = colony(tf.Medium(a=tf.Signal(50.0, source=1.0), **BOX))
+    model = scene.bind(2, device="cuda")
+    state, seen = model.start(), 0
+    for _ in range(12):
+        state = model.step(state)
+        for births in state.births:
+            seen += 1
+            for report in births.before.reports.values():
+                assert all(x.device.type == "cuda" for _, x in parameters(report))
+    assert seen
+
+
+def test_a_model_can_be_copied_and_a_step_without_change_returns_its_state(
+    pretended_cuda,  # noqa: F811
+):
+    model = colony().bind(2, device="cuda")
+    state = model.step(model.start())
+    again = pickle.loads(pickle.dumps(model.twins.copies))
+    assert torch.equal(again.here(state.length), state.length.cpu())
+    division = next(part for part in model.step_parts if part.title == "division")
+    assert isinstance(division, OnCpu) and division.run_step(state, 0.05) is state

@@ -9,8 +9,7 @@ run on the GPU, and so does everything if no backend is by kernels.
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, replace
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
@@ -21,6 +20,7 @@ from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
 from torchfilm.effect import BoundEffect
+from torchfilm.effects.bound_mechanics import BoundMechanics
 from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.lysis import Lysis
 from torchfilm.effects.medium import Medium
@@ -35,8 +35,10 @@ from torchfilm.together import Together
 from torchfilm.tools import checks
 from torchfilm.tools.numba_calls import unavailable
 from torchfilm.tools.parts import mapped
+from torchfilm.tools.ragged import Groups
 from torchfilm.tools.tangents import in_forward_mode
 from torchfilm.tools.timing import Timings
+from torchfilm.tools.warn_once import quietly
 from torchfilm.turns import Turns, in_turns
 from torchfilm.values import Distribution
 
@@ -57,6 +59,9 @@ class Copies:
         self._here = WeakIdKeyDictionary()  # by what is there: its copy, and its version then
         self._there = WeakIdKeyDictionary()  # by a copy: what it is of
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Copies, (self.device,)  # weak references cannot be pickled
+
     def here(self, part: Any) -> Any:
         """A tensor or layout on the CPU."""
         found, version = self._here.get(part, (None, None))
@@ -73,6 +78,19 @@ class Copies:
             return found
         made = part.to(self.device)
         return made if made is part else self._noted(made, part)[0]
+
+    def send(self, parts: Iterable[Any]) -> None:
+        """Makes the copies on the GPU of those tensors that have none, one way for each dtype: a
+        way of its own takes longer than the numbers of a small colony."""
+        waiting: dict[torch.dtype, list[Tensor]] = {}
+        for part in {id(part): part for part in parts}.values():
+            if isinstance(part, Tensor) and part.device.type == "cpu" and part not in self._there:
+                waiting.setdefault(part.dtype, []).append(part)
+        for tensors in waiting.values():
+            together = torch.cat([x.reshape(-1) for x in tensors]).to(self.device)
+            pieces = together.split([x.numel() for x in tensors])
+            for here, there in zip(tensors, pieces, strict=True):
+                self._noted(there.reshape(here.shape).clone(), here)
 
     def _noted(self, there: Any, here: Any) -> tuple[Any, Any]:
         if _version(there) is not None:
@@ -103,12 +121,15 @@ class OnCpu:
             for part in self.there:
                 state = part.run_step(state, dt, timings)
             return state
-        declared, copies = state.declared, self.twins.copies
+        copies = self.twins.copies
         with torch.no_grad():
-            state = _moved(state, copies.here, {**declared, **self.twins.declared})
+            here = made = _moved(state, copies.here, self.twins.declared_here(state.declared))
             for part in self.here:
-                state = part.run_step(state, dt, timings)
-            return _moved(state, copies.there, declared)
+                made = part.run_step(made, dt, timings)
+            if made is here:
+                return state
+            copies.send(_parts(made))
+            return _moved(made, copies.there, state.declared)
 
 
 def _moved(state: State, move: Callable[[Any], Any], declared: Mapping[str, Field]) -> State:
@@ -117,7 +138,10 @@ def _moved(state: State, move: Callable[[Any], Any], declared: Mapping[str, Fiel
 
     def change(path: str, part: Any) -> Any:
         if isinstance(part, State):
-            return part.moved(move).replace(declared=declared)
+            return _moved(part, move, declared)
+        if isinstance(part, Groups):  # without what it has worked out
+            zero = None if part.zero is None else move(part.zero)
+            return Groups(move(part.owner), part.size, part.ordered, zero)
         if isinstance(part, Births):  # anew, without the parents that it has looked up
             return Births(*(mapped(getattr(part, f.name), change) for f in fields(part)))
         return move(part) if isinstance(part, Tensor) else part
@@ -126,13 +150,24 @@ def _moved(state: State, move: Callable[[Any], Any], declared: Mapping[str, Fiel
     return state.moved(move).replace(declared=declared, **happened)
 
 
+def _parts(state: State) -> list[Any]:
+    """All tensors, and the layout, that `_moved` moves."""
+    found: list[Any] = []
+
+    def noted(part: Any) -> Any:
+        found.append(part)
+        return part
+
+    _moved(state, noted, state.declared)
+    return found
+
+
 class CpuTwins:
     """The effects of a model on a GPU, bound to the CPU as well.
 
     of: the twin of each effect that has one. kept: why others have none, by title, where one would
-    expect it. declared: the fields whose first values are found on the CPU in another way. parts:
-    of a step, by twins or not; joined_parts: the same, in which those that follow on one another
-    are joined.
+    expect it. parts: of a step, by twins or not; joined_parts: the same, in which those that follow
+    on one another are joined.
     """
 
     def __init__(self, model: Model, begin: FirstCells, state: State):
@@ -142,8 +177,8 @@ class CpuTwins:
         places = {e.place for e in model.effects if self._may_move(e)}
         batch = replace(model.batch, device=CPU)
         own = [e for e in model.effects if e.place in places]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what binding to the GPU has said
+        self._requires_grad = False
+        with quietly():  # binding to the GPU has said it
             here = type(model)(model.scene, batch, begin, places)
             bound = here.effects
             # effects of one place stand in the order of their stages in both
@@ -152,12 +187,10 @@ class CpuTwins:
             mixed = [self.of.get(e, e) for e in model.effects]
             for twin in self.of.values():
                 twin.check_others(mixed)
-        others = {n: f for n, f in model.first_fields.items() if n not in here.first_fields}
-        self.declared = {n: _first_there(field, self.copies) for n, field in others.items()}
-        self.declared |= here.first_fields
+        self._fields = here.first_fields
         tensors = [x for e in model.scene.effects for _, x in parameters(e)]
-        self._requires_grad = any(x.requires_grad for x in tensors) or any(
-            e.values.requires_grad for e in model.effects
+        self._requires_grad |= any(x.requires_grad for x in tensors) or any(
+            e.values.requires_grad or getattr(e, "needs_gradient", False) for e in model.effects
         )
         self._lay_out(in_turns(mixed), in_turns(model.effects))
 
@@ -177,6 +210,13 @@ class CpuTwins:
             return False
         given = (*(getattr(state, n) for n in PER_CELL), *state.fields.values())
         return self._requires_grad or any(x.requires_grad for x in given)
+
+    def declared_here(self, declared: Mapping[str, Field]) -> dict[str, Field]:
+        """Fields whose first values are found on the CPU: by twins, or by what is on the GPU."""
+        return {
+            n: self._fields[n] if n in self._fields else _first_there(field, self.copies)
+            for n, field in declared.items()
+        }
 
     def twin(self, effect: BoundEffect) -> BoundEffect | None:
         """The twin by which this effect is computed where no derivative is wanted, if any."""
@@ -220,7 +260,9 @@ class CpuTwins:
         for effect, twin in self.of.items():
             try:
                 if isinstance(twin.effect, Medium):
-                    _try_functions(twin.effect)
+                    self._requires_grad |= _try_functions(twin.effect)
+                if isinstance(twin, BoundMechanics):
+                    twin.try_walls(state)
                 state = twin.trace(state)
             except Exception as error:  # whatever a function that worked on the GPU raises here
                 failed.append(effect)
@@ -299,8 +341,20 @@ def _distributions(description: Any) -> list[Distribution]:
     return found
 
 
-def _try_functions(medium: Medium) -> None:
-    """Raises what the functions of positions raise on the CPU."""
-    for function in (medium.obstacles, *(medium.flow_of(name) for name in medium.signals)):
-        if callable(function):
-            function(torch.zeros(2, 3, dtype=torch.float64))
+def _try_functions(medium: Medium) -> bool:
+    """Whether a derivative may be wanted by what the functions of positions hold. Raises what one
+    raises on the CPU, and RuntimeError for values elsewhere."""
+    functions: list[Callable[[Tensor], Any]] = []
+
+    def noted(path: str, part: Any) -> Any:
+        if callable(part) and not isinstance(part, (Tensor, type)) and not _is_ours(type(part)):
+            functions.append(part)
+        return part
+
+    mapped(medium, noted)
+    with torch.enable_grad():
+        found = [f(torch.zeros(2, 3, dtype=torch.float64)) for f in functions]
+    for value in found:
+        if isinstance(value, Tensor) and value.device != CPU:
+            raise RuntimeError(f"a function of positions gives values on {value.device}")
+    return any(isinstance(x, Tensor) and x.requires_grad for x in found)

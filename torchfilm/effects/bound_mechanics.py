@@ -171,6 +171,11 @@ class BoundMechanics(BoundEffect):
     def by_kernels(self) -> bool:
         return self.compiled
 
+    def try_walls(self, state: State) -> None:
+        """Raises what kernels would of walls of the user's own."""
+        if self.compiled:
+            compiled.wall_arrays(*self._surfaces(state), state.colony_id, state.cells)
+
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0:
             return state

@@ -16,7 +16,9 @@ def mapped(part: Any, change: Callable[[str, Any], Any], path: str = "") -> Any:
     if isinstance(part, (tuple, list)):
         made = [mapped(item, change, f"{path}[{k}]") for k, item in enumerate(part)]
         same = all(a is b for a, b in zip(made, part, strict=True))
-        return part if same else type(part)(made)
+        if same:
+            return part
+        return type(part)(*made) if hasattr(part, "_fields") else type(part)(made)
     if isinstance(part, Mapping):
         each = {name: mapped(item, change, f"{path}[{name!r}]") for name, item in part.items()}
         return part if all(each[name] is part[name] for name in each) else each
