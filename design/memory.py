@@ -49,14 +49,16 @@ def kept_notes(
 
 
 def free_bytes(device: str) -> int:
-    """Bytes of memory that are free on a device."""
+    """Bytes of memory that are free on a device; on a GPU at most what is free on the CPU, where
+    kernels take a copy of its colonies."""
     if torch.device(device).type == "cuda":
         # torch reuses the memory that it holds in reserve for its next batch
-        return (
+        there = (
             torch.cuda.mem_get_info(torch.device(device))[0]
             + torch.cuda.memory_reserved(device)
             - torch.cuda.memory_allocated(device)
         )
+        return min(there, free_bytes("cpu"))
     for line in _text(Path("/proc/meminfo")).splitlines():
         if line.startswith("MemAvailable:"):
             return min(1024 * int(line.split()[1]), bytes_of_group())
