@@ -250,5 +250,17 @@ def test_descriptions_with_keywords_of_their_own_can_be_replaced():
     by_type = tf.Circuit({0: circuit.rates["every cell"], 2: lambda u, s, p, cell: {"m": -u.m}},
                          species=("m",), k=2.0)  # fmt: skip
     assert replace(by_type, steps=1).rates == by_type.rates
+    assert replace(medium, b=tf.Signal(1.0)).signals.keys() == {"ahl", "b"}
+    for wrong, error in (
+        (lambda: replace(medium, signals=tf.Signal(5.0)), "Medium.signals = .*a mapping by name"),
+        (lambda: replace(medium, signals={"a b": tf.Signal(5.0)}), "Medium.signals = 'a b'"),
+        (lambda: replace(medium, signals={"box": tf.Signal(5.0)}), "Medium.signals = 'box'"),
+        (lambda: replace(circuit, parameters={"rtol": 2.0}), "Circuit.parameters = 'rtol'"),
+        (lambda: replace(circuit, parameters={0: 1.0, 1: 2.0}), "Circuit.parameters = 0"),
+        (lambda: tf.Circuit({**circuit.rates, 0: [tf.Reaction({}, {"m": 1}, 1.0)]},
+                            species=("m",)), "by cell types that are integers"),
+    ):  # fmt: skip
+        with pytest.raises(tf.InputError, match=error):
+            wrong()
     with pytest.raises(tf.InputError, match="k = -inf"):
         replace(circuit, parameters={"k": -torch.inf})

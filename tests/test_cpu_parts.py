@@ -205,6 +205,35 @@ def test_what_does_not_change_is_copied_once(pretended_cuda):  # noqa: F811
     assert copies.here(frozen) is not copies.here(frozen)
 
 
+def test_tensors_that_are_sent_together_do_not_travel_again(pretended_cuda):  # noqa: F811
+    copies = Copies(torch.device("cuda:0"))
+    many = [torch.arange(6.0).reshape(2, 3), torch.zeros(0), torch.tensor([True, False])]
+    many += [torch.arange(3), torch.arange(4.0)[::2], torch.ones((), dtype=torch.float64)]
+    kept = copies.send([*many, many[0], "no tensor"])
+    assert len(kept) == len(many)
+    for here in many:
+        (there,) = (x for x in kept if x is copies.there(here))
+        assert there.device.type == "cuda" and there.dtype == here.dtype
+        assert torch.equal(there.cpu(), here) and copies.here(there) is here
+
+
+def test_no_tensor_of_a_step_is_sent_by_itself(pretended_cuda, monkeypatch):  # noqa: F811
+    model = colony().bind(2, device="cuda")
+    state = model.step(model.start())
+    noted, there, made, alone = Copies._noted, Copies.there, [], []
+
+    def counted(self, part):
+        before = len(made)
+        found = there(self, part)
+        alone.extend(made[before:])
+        return found
+
+    monkeypatch.setattr(Copies, "_noted", lambda self, *pair: made.append(1) or noted(self, *pair))
+    monkeypatch.setattr(Copies, "there", counted)
+    model.step(state)
+    assert len(made) > 5 and not alone
+
+
 def test_a_field_that_is_edited_in_place_is_seen(pretended_cuda):  # noqa: F811
     scene = colony()
     there, here = (scene.bind(2, device=device) for device in ("cuda", "cpu"))
@@ -255,6 +284,32 @@ def test_derivatives_by_what_a_function_of_positions_holds_pass(pretended_cuda, 
     assert state.signals["a"].requires_grad
     with torch.no_grad():
         assert not model.step(state).signals["a"].requires_grad
+
+
+def test_derivatives_that_show_late_pass(pretended_cuda):  # noqa: F811
+    """Far from the origin only, or wanted since the scene was bound."""
+    held = torch.tensor(0.7, dtype=torch.float64)
+
+    def law(x):
+        far = x[:, 0] > 15.0
+        return torch.where(far, held.to(x.device), 0.0) if bool(far.any()) else 0.0 * x[:, 0]
+
+    scene = colony(tf.Medium(a=tf.Signal(50.0, source=law), **BOX))
+    model = scene.bind(2, device="cuda", dtype=torch.float64)
+    held.requires_grad_(True)
+    assert model.step(model.start()).signals["a"].requires_grad
+    again = scene.bind(2, device="cuda", dtype=torch.float64)
+    assert again.step(again.start()).signals["a"].requires_grad
+
+
+def test_functions_that_hold_in_their_box_only_are_by_kernels(pretended_cuda):  # noqa: F811
+    def law(x):
+        assert float(x.min()) > -21.0 and float(x[:, 0].min()) > 9.0
+        return x[:, 0]
+
+    box = {**BOX, "box": ((10.0, -20.0), (42.0, 20.0))}
+    scene = colony(tf.Medium(a=tf.Signal(50.0, source=law), outside="reservoir", **box))
+    assert not scene.bind(2, device="cuda").twins.kept
 
 
 @pytest.mark.parametrize("where", ["source", "decay", "initial", "flow"])

@@ -25,6 +25,7 @@ from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.lysis import Lysis
 from torchfilm.effects.medium import Medium
 from torchfilm.effects.medium_reactions import MediumReactions
+from torchfilm.effects.medium_transport import held_tensors
 from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.rules import Rules
 from torchfilm.founders import FirstCells
@@ -79,9 +80,13 @@ class Copies:
         made = part.to(self.device)
         return made if made is part else self._noted(made, part)[0]
 
-    def send(self, parts: Iterable[Any]) -> None:
+    def send(self, parts: Iterable[Any]) -> list[Tensor]:
         """Makes the copies on the GPU of those tensors that have none, one way for each dtype: a
-        way of its own takes longer than the numbers of a small colony."""
+        way of its own takes longer than the numbers of a small colony. `there` knows them as long
+        as what is returned is held."""
+        sent: list[Tensor] = []
+        if torch.is_inference_mode_enabled():
+            return sent  # no versions: nothing would be known
         waiting: dict[torch.dtype, list[Tensor]] = {}
         for part in {id(part): part for part in parts}.values():
             if isinstance(part, Tensor) and part.device.type == "cpu" and part not in self._there:
@@ -90,7 +95,8 @@ class Copies:
             together = torch.cat([x.reshape(-1) for x in tensors]).to(self.device)
             pieces = together.split([x.numel() for x in tensors])
             for here, there in zip(tensors, pieces, strict=True):
-                self._noted(there.reshape(here.shape).clone(), here)
+                sent.append(self._noted(there.reshape(here.shape).clone(), here)[0])
+        return sent
 
     def _noted(self, there: Any, here: Any) -> tuple[Any, Any]:
         if _version(there) is not None:
@@ -128,8 +134,10 @@ class OnCpu:
                 made = part.run_step(made, dt, timings)
             if made is here:
                 return state
-            copies.send(_parts(made))
-            return _moved(made, copies.there, state.declared)
+            kept = copies.send(_parts(made))
+            made = _moved(made, copies.there, state.declared)
+            del kept  # until here, so that none is sent again
+            return made
 
 
 def _moved(state: State, move: Callable[[Any], Any], declared: Mapping[str, Field]) -> State:
@@ -178,6 +186,7 @@ class CpuTwins:
         batch = replace(model.batch, device=CPU)
         own = [e for e in model.effects if e.place in places]
         self._requires_grad = False
+        self._held: list[Tensor] = []  # by functions of positions
         with quietly():  # binding to the GPU has said it
             here = type(model)(model.scene, batch, begin, places)
             bound = here.effects
@@ -208,7 +217,7 @@ class CpuTwins:
             return True
         if not torch.is_grad_enabled():
             return False
-        given = (*(getattr(state, n) for n in PER_CELL), *state.fields.values())
+        given = (*(getattr(state, n) for n in PER_CELL), *state.fields.values(), *self._held)
         return self._requires_grad or any(x.requires_grad for x in given)
 
     def declared_here(self, declared: Mapping[str, Field]) -> dict[str, Field]:
@@ -260,7 +269,7 @@ class CpuTwins:
         for effect, twin in self.of.items():
             try:
                 if isinstance(twin.effect, Medium):
-                    self._requires_grad |= _try_functions(twin.effect)
+                    self._requires_grad |= self._try_functions(twin.effect, state)
                 if isinstance(twin, BoundMechanics):
                     twin.try_walls(state)
                 state = twin.trace(state)
@@ -278,6 +287,27 @@ class CpuTwins:
                     f" {why or 'it works together with an effect that is not'}. Leave backend out."
                 )
             self.of.pop(effect, None)
+
+    def _try_functions(self, medium: Medium, state: State) -> bool:
+        """Whether a derivative may be wanted by what the functions of positions give. Raises what
+        one raises on the CPU, at the voxels of a state, and RuntimeError for values elsewhere."""
+        functions: list[Callable[[Tensor], Any]] = []
+
+        def noted(path: str, part: Any) -> Any:
+            if callable(part) and not isinstance(part, (Tensor, type)) and not _is_ours(type(part)):
+                functions.append(part)
+            return part
+
+        mapped(medium, noted)
+        assert state.layout is not None
+        at = state.layout.grid.centres() if functions else torch.zeros(0)
+        with torch.enable_grad():
+            found = [f(at) for f in functions]
+        for value in found:
+            if isinstance(value, Tensor) and value.device != CPU:
+                raise RuntimeError(f"a function of positions gives values on {value.device}")
+        self._held += [x for f in functions for x in held_tensors(f)]
+        return any(isinstance(x, Tensor) and x.requires_grad for x in found)
 
     def _lay_out(self, here: list[Part], there: list[Part]) -> None:
         """Finds the parts of a step. here: with twins; there: without."""
@@ -339,22 +369,3 @@ def _distributions(description: Any) -> list[Distribution]:
 
     mapped(description, noted)
     return found
-
-
-def _try_functions(medium: Medium) -> bool:
-    """Whether a derivative may be wanted by what the functions of positions hold. Raises what one
-    raises on the CPU, and RuntimeError for values elsewhere."""
-    functions: list[Callable[[Tensor], Any]] = []
-
-    def noted(path: str, part: Any) -> Any:
-        if callable(part) and not isinstance(part, (Tensor, type)) and not _is_ours(type(part)):
-            functions.append(part)
-        return part
-
-    mapped(medium, noted)
-    with torch.enable_grad():
-        found = [f(torch.zeros(2, 3, dtype=torch.float64)) for f in functions]
-    for value in found:
-        if isinstance(value, Tensor) and value.device != CPU:
-            raise RuntimeError(f"a function of positions gives values on {value.device}")
-    return any(isinstance(x, Tensor) and x.requires_grad for x in found)

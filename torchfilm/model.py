@@ -75,12 +75,13 @@ class Model:
 
     # --- running -------------------------------------------------------------------------
 
+    @one_torch_thread()
     def start(self, seed: int | None = None) -> State:
         """The first state: founders, all fields at their first values, grids laid. seed: of what is
         drawn; by default that of the model."""
         begin = self._begin
         if seed is not None:
-            checks.integer("seed", seed, least=0, most=2**63 - 1)
+            seed = checks.integer("seed", seed, least=0, most=2**63 - 1)
             begin = replace(begin, seed=seed)
         state = self._laid(begin)
         for effect in self.effects:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -359,14 +359,14 @@ class State:
         per colony; its stream of random numbers; and the batch its seed, step and time. Raises
         InputError for a state of another scene.
         """
-        places = row_checks.checked_places("colonies", colonies, self.colonies, self.device)
-        return state_colonies.put(self, places, other, taken)
+        return state_colonies.put(self, colonies, other, taken)
 
-    def detach(self, keep: Collection[str] = ()) -> State:
+    def detach(self) -> State:
         """The same state without the derivatives that it carries, as where a backward pass is cut
-        off. keep: fields that keep theirs, such as growth_rate, a column of the cells by which all
-        derivatives by Growth.rate go."""
-        return state_colonies.detached(self, keep)
+        off: also without those of columns such as growth_rate, by which derivatives by Growth.rate
+        go on."""
+        cut = self.moved(lambda part: part.detach() if isinstance(part, Tensor) else part)
+        return cut.replace(births=(), ended=(), reports={})
 
     def to(self, device: str | torch.device) -> State:
         """The same state on another device."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from torchfilm.tools import checks, row_checks
+from torchfilm.tools import checks, displays, row_checks
 from torchfilm.tools.ragged import offsets
+from torchfilm.tools.threads import one_torch_thread
 
 if TYPE_CHECKING:
     from torchfilm.state import State
@@ -42,23 +42,21 @@ def selected(state: State, places: Tensor) -> State:
     )
 
 
-def detached(state: State, keep: Collection[str]) -> State:
-    """The state without derivatives, but for those of the fields in `keep`."""
-    for name in [keep] if isinstance(keep, str) else keep:
-        checks.choice("keep", name, [*state.fields])
-    kept = {n: x for n, x in state.fields.items() if n in keep}
-    cut = state.moved(lambda part: part.detach() if isinstance(part, Tensor) else part)
-    return cut.replace(births=(), ended=(), reports={}, fields={**cut.fields, **kept})
-
-
-def put(state: State, places: Tensor, other: State, taken: object) -> State:
-    """The state with the colonies `taken` (b,) of another one at these places (b,) int64."""
+@one_torch_thread()  # the tensors are short
+def put(state: State, given: Any, other: State, taken: Any) -> State:
+    """See `State.put`."""
+    places = row_checks.checked_places("colonies", given, state.colonies, state.device, least=0)
     check_alike(state, other)
     rows = checked_taken(taken, places, other.colonies)
+    if places.numel() == 0:
+        return state
     order = torch.arange(state.colonies, device=state.device)
     order = order.index_copy(0, places, state.colonies + rows)
     made = selected(_side_by_side(state, other), order)
-    return made.replace(colony_id=state.colony_id, stream=state.stream)
+    layout = made.layout
+    if layout is not None and state.layout is not None and layout.grid.alike(state.layout.grid):
+        layout = state.layout  # which has found out much about its grid
+    return made.replace(colony_id=state.colony_id, stream=state.stream, layout=layout)
 
 
 def _side_by_side(state: State, other: State) -> State:
@@ -109,18 +107,20 @@ def check_alike(state: State, other: State) -> None:
             raise checks.input_error(told, theirs, f"{mine}, as this state's medium has", hint)
 
 
-def checked_taken(given: object, places: Tensor, count: int) -> Tensor:
+def checked_taken(given: Any, places: Tensor, count: int) -> Tensor:
     """Which colonies of another state, of `count`, go to these places; by default the first ones
     in order. Raises InputError where there are not as many."""
     if given is None:
-        rule = f"{places.numel()} colonies, one for each place"
+        wanted = displays.counted(places.numel(), "colony", "colonies")
+        rule = f"{wanted}, one for each place"
         if count != places.numel():
+            has = displays.counted(count, "colony", "colonies")
             raise checks.input_error(
-                "other", f"{count} colonies", rule, "Say which by taken=…, such as taken=[0, 0]."
+                "other", f"of {has}", rule, "Say which by taken=…, such as taken=[0, 0]."
             )
         return torch.arange(count, device=places.device)
-    taken = row_checks.checked_places("taken", given, count, places.device, distinct=False)
+    taken = row_checks.checked_places("taken", given, count, places.device, distinct=False, least=0)
     if taken.numel() != places.numel():
-        rule = f"{places.numel()} places, one for each of `colonies`"
+        rule = f"{displays.counted(places.numel(), 'place')}, one for each of `colonies`"
         raise checks.input_error("taken", taken.tolist(), rule)
     return taken

@@ -121,13 +121,14 @@ class Circuit(Effect):
         by_type: dict[int | str, Part] = (
             dict(rates.items()) if isinstance(rates, Mapping) else {EVERY: rates}
         )
-        parameters = keywords(parameters, "parameters")
+        options = [f.name for f in dataclasses.fields(self)]
+        parameters = keywords("Circuit", parameters, "parameters", options)
         names = names_of(species)
         others = shared_fields(shared)
         check_species(names, others)
-        check_rates(by_type, EVERY not in by_type)
+        check_rates(by_type, [*by_type] != [EVERY])
         check_initial(initial, names)
-        check_constants(parameters, [f.name for f in dataclasses.fields(self)])
+        check_constants(parameters, options)
         check_method(method, steps, by_type)
         check_backend("Circuit", backend)
         checks.choice("Circuit.daughters", daughters, ("concentration", "amount"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -128,7 +128,8 @@ class Medium(Effect):
         backend: str | None = None,
         **signals: Signal,
     ):
-        signals = _named(signals)
+        options = [f.name for f in fields(self)]
+        signals = _named(keywords("Medium", signals, "signals", options))
         low, high, voxel = checked_box(box, spacing, depth, height)
         _check_medium(boundary, outside, grows, margin, method, steps, splitting, obstacles)
         if exchange is not None:
@@ -385,9 +386,8 @@ def _stays_0(name: str) -> str:
     )
 
 
-def _named(signals: Mapping[str, Any]) -> dict[str, Any]:
+def _named(signals: dict[str, Any]) -> dict[str, Any]:
     """The signals by name, checked."""
-    signals = keywords(signals, "signals")
     if not signals:
         raise checks.InputError(
             "Medium() has no signal: name at least one, such as ahl=tf.Signal(diffusion=10.0)."

@@ -321,10 +321,13 @@ def _velocity(flow: Flow, layout: Layout, batch: GridBatch, own: Callable[[Any],
 def _closure_tensors(signal: Signal, flow: Flow) -> list[Tensor]:
     """Tensors in the closures of functions of positions."""
     functions = [f for f in (signal.decay, signal.source, flow) if callable(f)]
-    cells = [
-        cell.cell_contents for f in functions for cell in getattr(f, "__closure__", None) or ()
-    ]
-    return [x for x in cells if isinstance(x, Tensor)]
+    return [x for f in functions for x in held_tensors(f)]
+
+
+def held_tensors(function: Callable[..., Any]) -> list[Tensor]:
+    """Tensors in the closure of a function."""
+    cells = getattr(function, "__closure__", None) or ()
+    return [cell.cell_contents for cell in cells if isinstance(cell.cell_contents, Tensor)]
 
 
 def _first_values(signal: Signal, name: str, state: State, rows: Tensor) -> Tensor:

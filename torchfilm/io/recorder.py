@@ -130,10 +130,12 @@ class Recorder(metaclass=checks.KnownKeywords):
         self.model, self.dt = model, dt
 
     def __call__(self, state: State) -> None:
-        self.last = state
+        before, self.last = self.last, state
         if self.file is None:
             self._open(state)  # earlier events belong to no frame of this run
             return
+        if before is not None:
+            _check_course(before, state)
         self._note_events(state)
         if (state.step - self.first_step) % self.every == 0:
             self._write(state)
@@ -278,6 +280,14 @@ class Recorder(metaclass=checks.KnownKeywords):
                 f"of {there}, as {self.path} is",
                 "Record to a file of its own.",
             )
+        keys = lambda ids, uid: {*zip(ids.tolist(), uid.tolist(), strict=True)}
+        frame = kept.frame()
+        known = keys(kept.colony_id[frame["colony"]], frame["uid"])
+        if not keys(state.own_colony_id, state.uid) <= known:
+            raise checks.input_error(
+                "state", "with other cells", f"of cells of the last frame of {self.path}",
+                "Record to a file of its own.",
+            )  # fmt: skip
         last = int(kept.steps[-1])
         if last != state.step:
             raise checks.input_error(
@@ -406,3 +416,20 @@ class Recorder(metaclass=checks.KnownKeywords):
             self._append(f"frames/{name}", np.asarray(row[name])[None], frame)
         file.flush()
         self.births, self.ends = [], []
+
+
+def _check_course(before: State, state: State) -> None:
+    """Raise InputError where colonies have cells that were neither there a step ago, nor born in
+    this step: the lineage would lead nowhere."""
+    if not torch.equal(before.colony_id, state.colony_id):
+        return
+    born = sum(b.parents.groups.counts for b in state.births)
+    strange = state.next_uid != before.next_uid + 2 * born
+    if not bool(strange.any()):
+        return
+    names = ", ".join(map(str, state.colony_id[strange].tolist()[:5]))
+    raise checks.InputError(
+        f"colony {names} has other cells at step {state.step} than a step ago and their daughters,"
+        " as after state.put. A file of results knows one course of each colony: end this run, and"
+        " record what follows to a file of its own."
+    )

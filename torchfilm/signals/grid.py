@@ -87,6 +87,14 @@ class Grid:
     def colonies(self) -> int:
         return self.origin.shape[0]
 
+    def alike(self, other: Grid) -> bool:
+        """Whether another grid has the same voxels."""
+        return (
+            self.spacing == other.spacing
+            and torch.equal(self.shape, other.shape)
+            and torch.equal(self.origin, other.origin)
+        )
+
     @property
     def voxel_volume(self) -> float:
         """µm³."""

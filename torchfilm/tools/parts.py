@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
+
+from torchfilm.tools import checks
 
 
 def mapped(part: Any, change: Callable[[str, Any], Any], path: str = "") -> Any:
@@ -35,10 +37,20 @@ def mapped(part: Any, change: Callable[[str, Any], Any], path: str = "") -> Any:
     return part
 
 
-def keywords(given: Mapping[str, Any], name: str) -> dict[str, Any]:
+def keywords(
+    owner: str, given: Mapping[str, Any], name: str, options: Collection[str]
+) -> dict[str, Any]:
     """Keywords that a description keeps as one mapping; under the `name` of this,
-    `dataclasses.replace` gives those that it has."""
-    kept = given.get(name)
-    if not isinstance(kept, Mapping):
+    `dataclasses.replace` gives those that it has. options: its other parameters. Raises InputError
+    for what is no mapping of names that keywords could have."""
+    if name not in given:
         return {**given}
+    kept = given[name]
+    if not isinstance(kept, Mapping):
+        rule = f"a mapping by name; what stands in it has another name than {name!r}"
+        raise checks.input_error(f"{owner}.{name}", kept, rule)
+    for n in kept:
+        if not isinstance(n, str) or not n.isidentifier() or n in options:
+            rule = "an identifier that is no parameter of its own"
+            raise checks.input_error(f"name in {owner}.{name}", n, rule)
     return {**kept, **{n: x for n, x in given.items() if n != name}}

@@ -50,9 +50,10 @@ def check_mask(name: str, mask: Any, count: int) -> None:
 
 
 def checked_places(
-    name: str, given: Any, count: int, device: torch.device, *, distinct: bool = True
-) -> Tensor:
-    """Places from 0 to count − 1, at least one, (M,) int64. distinct: none comes twice."""
+    name: str, given: Any, count: int, device: torch.device, *, distinct: bool = True,
+    least: int = 1,
+) -> Tensor:  # fmt: skip
+    """Places from 0 to count − 1, at least so many, (M,) int64. distinct: none comes twice."""
     try:
         places = torch.as_tensor(given, device=device).reshape(-1)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -62,8 +63,8 @@ def checked_places(
         hint = "torch.nonzero(mask)[:, 0] has those of a mask." if mask else ""
         raise checks.input_error(name, given, "whole numbers, such as [0, 2]", hint)
     places = places.to(torch.int64)
-    if places.numel() == 0 or bool((places < 0).any()) or bool((places >= count).any()):
-        rule = f"places from 0 to {count - 1}, at least one"
+    if places.numel() < least or bool((places < 0).any()) or bool((places >= count).any()):
+        rule = f"places from 0 to {count - 1}" + (", at least one" if least else "")
         raise checks.input_error(name, places.tolist(), rule)
     if distinct and torch.unique(places).numel() != places.numel():
         raise checks.input_error(name, places.tolist(), "different places")
