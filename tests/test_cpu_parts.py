@@ -217,6 +217,17 @@ def test_tensors_that_are_sent_together_do_not_travel_again(pretended_cuda):  # 
         assert torch.equal(there.cpu(), here) and copies.here(there) is here
 
 
+def test_copies_of_the_last_state_only_are_kept(pretended_cuda):  # noqa: F811
+    model = colony().bind(2, device="cuda")
+    states = [model.start()]
+    for _ in range(8):
+        states.append(model.step(states[-1]))
+    alive = [known() for known, _ in model.twins.copies._here.values() if known() is not None]
+    last = [*columns(model.twins.last).values(), *vars(model.twins.last).values()]
+    of_last = {id(x) for x in last}
+    assert len(alive) > 5 and all(id(x) in of_last for x in alive if x.dim() and len(x) > 2)
+
+
 def test_no_tensor_of_a_step_is_sent_by_itself(pretended_cuda, monkeypatch):  # noqa: F811
     model = colony().bind(2, device="cuda")
     state = model.step(model.start())

@@ -52,8 +52,8 @@ EXCHANGE = (Circuit, Medium, MediumReactions, Monod, Lysis)  # by the medium wit
 
 
 class Copies:
-    """Tensors and layouts of a GPU with their copies on the CPU, made once while the first is in
-    use; so what a step leaves as it is does not travel."""
+    """Tensors and layouts of a GPU and their copies on the CPU, each of which knows the other while
+    both are in use; so what a step leaves as it is does not travel."""
 
     def __init__(self, device: torch.device):
         self.device = device
@@ -65,7 +65,8 @@ class Copies:
 
     def here(self, part: Any) -> Any:
         """A tensor or layout on the CPU."""
-        found, version = self._here.get(part, (None, None))
+        known, version = self._here.get(part, (None, None))
+        found = None if known is None else known()
         if found is not None and version == _version(part):
             return found
         made = part.to(CPU)
@@ -100,7 +101,7 @@ class Copies:
 
     def _noted(self, there: Any, here: Any) -> tuple[Any, Any]:
         if _version(there) is not None:
-            self._here[there] = here, _version(there)
+            self._here[there] = ref(here), _version(there)
             self._there[here] = ref(there)
         return there, here
 
@@ -134,7 +135,8 @@ class OnCpu:
                 made = part.run_step(made, dt, timings)
             if made is here:
                 return state
-            kept = copies.send(_parts(made))
+            # of the last state only: who keeps many on the GPU keeps no copies
+            self.twins.last, kept = made, copies.send(_parts(made))
             made = _moved(made, copies.there, state.declared)
             del kept  # until here, so that none is sent again
             return made
@@ -175,12 +177,13 @@ class CpuTwins:
 
     of: the twin of each effect that has one. kept: why others have none, by title, where one would
     expect it. parts: of a step, by twins or not; joined_parts: the same, in which those that follow
-    on one another are joined.
+    on one another are joined. last: the copy of the state that was made last.
     """
 
     def __init__(self, model: Model, begin: FirstCells, state: State):
         """begin: its first cells. state: on which its effects were traced."""
         self.model, self.copies = model, Copies(state.device)
+        self.last: State | None = None  # on the CPU, after a step
         self.kept: dict[str, str] = {}
         places = {e.place for e in model.effects if self._may_move(e)}
         batch = replace(model.batch, device=CPU)
@@ -202,6 +205,9 @@ class CpuTwins:
             e.values.requires_grad or getattr(e, "needs_gradient", False) for e in model.effects
         )
         self._lay_out(in_turns(mixed), in_turns(model.effects))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "last": None}  # a model that is copied holds no state
 
     @staticmethod
     def of_model(model: Model, begin: FirstCells, state: State) -> CpuTwins | None:
