@@ -201,11 +201,12 @@ def test_a_recording_refuses_colonies_of_another_course(tmp_path):
                 states.send(state.put([1], model.start(seed=4), taken=[1]))
     with tf.Results(path) as results:
         last = results.state(scene)
-    assert last.step >= 39
-    mixed = last.put([1], model.start(seed=4), taken=[1])
-    mixed = mixed.replace(uid=mixed.uid + 900 * (mixed.colony == 1))
-    with pytest.raises(tf.InputError, match="with other cells"):
-        [*tf.simulate(scene, mixed, until=3.0, record=tf.Recorder(path, scene, append=True))]
+    assert last.step == 40 and int(last.counts[1]) > 1  # not that of the course that was put
+    younger = last.put([1], model.start(seed=4), taken=[1])
+    strange = last.replace(uid=last.uid + 900 * (last.colony == 1))
+    for mixed in (younger, strange):
+        with pytest.raises(tf.InputError, match="with other cells"):
+            [*tf.simulate(scene, mixed, until=3.0, record=tf.Recorder(path, scene, append=True))]
     *_, end = tf.simulate(scene, last, until=3.0, record=tf.Recorder(path, scene, append=True))
     assert end.time == pytest.approx(3.0)
 

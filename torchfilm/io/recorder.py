@@ -130,12 +130,12 @@ class Recorder(metaclass=checks.KnownKeywords):
         self.model, self.dt = model, dt
 
     def __call__(self, state: State) -> None:
-        before, self.last = self.last, state
+        if self.file is not None and self.last is not None:
+            _check_course(self.last, state)  # the file ends with the last state before
+        self.last = state
         if self.file is None:
             self._open(state)  # earlier events belong to no frame of this run
             return
-        if before is not None:
-            _check_course(before, state)
         self._note_events(state)
         if (state.step - self.first_step) % self.every == 0:
             self._write(state)
@@ -283,7 +283,8 @@ class Recorder(metaclass=checks.KnownKeywords):
         keys = lambda ids, uid: {*zip(ids.tolist(), uid.tolist(), strict=True)}
         frame = kept.frame()
         known = keys(kept.colony_id[frame["colony"]], frame["uid"])
-        if not keys(state.own_colony_id, state.uid) <= known:
+        same = np.array_equal(kept.next_uid(), numpy_of(state.next_uid))
+        if not same or not keys(state.own_colony_id, state.uid) <= known:
             raise checks.input_error(
                 "state", "with other cells", f"of cells of the last frame of {self.path}",
                 "Record to a file of its own.",
