@@ -75,8 +75,9 @@ def check_as_on_the_cpu(name: str) -> None:
         assert torch.allclose(found.cpu().double(), right.double(), rtol=1e-6, atol=1e-9), n
 
 
+@pytest.mark.parametrize("kinds", [(), (*KINDS, tf.MediumReactions)], ids=["kernels", "torch"])
 @torch.no_grad()
-def test_cells_burst_and_signals_react_where_they_are(pretended_cuda):  # noqa: F811
+def test_cells_burst_and_signals_react_where_they_are(pretended_cuda, kinds):  # noqa: F811
     def draw(cells):
         cells.mutations = cells.mutations + cells.poisson(0.5) + cells.normal().abs()
         cells.near = cells.signals.b * 1.0
@@ -92,6 +93,7 @@ def test_cells_burst_and_signals_react_where_they_are(pretended_cuda):  # noqa: 
                       box=[[-20.0, -20.0], [20.0, 20.0]], spacing=4.0, depth=1.0),
             founders=tf.Cells([[1.5 * k - 9, 0.0] for k in range(12)], [[0.0, 1.0]] * 12),
         )  # fmt: skip
+        scene = by_torch(scene, *(kinds if device == "cuda" else ()))
         state = scene.bind(2, device=device, dtype=torch.float64).start()
         for _ in range(6):
             state = step(scene, state, 0.05)

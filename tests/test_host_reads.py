@@ -7,12 +7,12 @@ a number that only the device knows.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import pytest
 import torch
 from mock_cuda import pretended_cuda  # noqa: F401
+from test_devices import KINDS, by_torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchfilm as tf
@@ -102,9 +102,7 @@ def colony(contacts: str, **more) -> tuple[tf.Effect, ...]:
 
 
 def signalling() -> tf.Scene:
-    scene = tf.scenes.quorum_sensing()
-    by_torch = lambda e: replace(e, backend="torch") if isinstance(e, tf.Mechanics) else e
-    return scene.replace(*(by_torch(e) for e in scene.effects))
+    return by_torch(tf.scenes.quorum_sensing(), *KINDS)
 
 
 # The bounds, reads a step, and what they are made of. A pass of one-sided contacts, of which most
