@@ -37,7 +37,8 @@ def test_first_concentrations_as_numbers_per_colony_drawn_or_given(dtype, device
     )
 
 
-def test_each_type_runs_its_own_circuit_and_others_are_only_diluted(dtype, device):
+@pytest.mark.parametrize("backend", [None, "torch"])
+def test_each_type_runs_its_own_circuit_and_others_are_only_diluted(dtype, device, backend):
     def decays(u, s, p, cell):
         return {"m": -p.g * u.m}
 
@@ -48,6 +49,7 @@ def test_each_type_runs_its_own_circuit_and_others_are_only_diluted(dtype, devic
         k=2.0,
         g=0.5,
         rtol=1e-8,
+        backend=backend,
     )
     scene = resting(circuit, 5, tf.Growth(rate=0.2), cell_type=[0, 7, 3, 4, 0])
     state = scene.bind(dtype=dtype, device=device).start()
@@ -67,7 +69,8 @@ def test_each_type_runs_its_own_circuit_and_others_are_only_diluted(dtype, devic
 
 
 def test_slopes_that_are_numbers_are_on_the_device(pretended_cuda):  # noqa: F811
-    test_each_type_runs_its_own_circuit_and_others_are_only_diluted(torch.float64, "cuda")
+    of_types = test_each_type_runs_its_own_circuit_and_others_are_only_diluted
+    of_types(torch.float64, "cuda", "torch")
 
 
 @pytest.mark.filterwarnings("ignore:Circuit has rates for cells of type:UserWarning")  # by hand
