@@ -80,7 +80,7 @@ def test_copies_go_on_by_the_random_numbers_and_parameters_of_their_places():
     a, b, c = (copies.select([k]) for k in range(3))
     assert torch.equal(a.position, c.position) and torch.equal(a.uid, b.uid)
     assert torch.equal(a.signals["a"], c.signals["a"])
-    # a growth rate is a column of the cells; daughters draw their thresholds anew
+    # a growth rate is a column of the cells; daughters draw thresholds of their own
     after = run(scene, copies, 40)
     a, b, c = (after.select([k]) for k in range(3))
     assert not torch.equal(a.division_threshold, b.division_threshold)
@@ -153,7 +153,7 @@ def test_colonies_are_put_on_a_gpu(pretended_cuda):  # noqa: F811
 
 
 def test_a_backward_pass_may_be_cut_off_many_times():
-    """Windows with divisions: the column of growth rates is set anew after each."""
+    """Windows with divisions: the column of growth rates is set again after each."""
     rate = torch.tensor([1.0, 1.3], dtype=torch.float64, requires_grad=True)
     scene = tf.Scene(tf.Growth(rate=rate), tf.Division(length=2.4), dim=2, dt=0.1)
     state, slopes = scene.bind(2, dtype=torch.float64).start(), []

@@ -272,7 +272,7 @@ def test_constants_are_needed_where_the_circuit_runs():
 
 @pytest.mark.parametrize("transform", [torch.func.grad, torch.func.vmap])
 def test_values_in_a_transform_of_torch_func_are_refused(transform):
-    """Whatever they are for; torch's own words would not tell why."""
+    """Whatever they are for; torch's own words do not say why."""
     for make in (
         lambda x: tf.Growth(rate=x),
         lambda x: tf.Mechanics(dim=2, viscosity=x),

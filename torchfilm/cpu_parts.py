@@ -32,21 +32,19 @@ from torchfilm.founders import FirstCells
 from torchfilm.joined_step import JoinedStep, joined
 from torchfilm.parameters import parameters
 from torchfilm.state import PER_CELL, Births, Field, State
-from torchfilm.together import Together
 from torchfilm.tools import checks
 from torchfilm.tools.numba_calls import unavailable
-from torchfilm.tools.parts import mapped
+from torchfilm.tools.parts import mapped, parts_of
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.tangents import in_forward_mode
 from torchfilm.tools.timing import Timings
 from torchfilm.tools.warn_once import quietly
-from torchfilm.turns import Turns, in_turns
+from torchfilm.turns import Part, in_turns
 from torchfilm.values import Distribution
 
 if TYPE_CHECKING:
     from torchfilm.model import Model
 
-Part = BoundEffect | Turns | Together
 CPU = torch.device("cpu")
 EXCHANGE = (Circuit, Medium, MediumReactions, Monod, Lysis)  # by the medium with one another
 
@@ -152,7 +150,7 @@ def _moved(state: State, move: Callable[[Any], Any], declared: Mapping[str, Fiel
         if isinstance(part, Groups):  # without what it has worked out
             zero = None if part.zero is None else move(part.zero)
             return Groups(move(part.owner), part.size, part.ordered, zero)
-        if isinstance(part, Births):  # anew, without the parents that it has looked up
+        if isinstance(part, Births):  # made again, without the parents that it has looked up
             return Births(*(mapped(getattr(part, f.name), change) for f in fields(part)))
         return move(part) if isinstance(part, Tensor) else part
 
@@ -256,17 +254,18 @@ class CpuTwins:
     # --- binding -------------------------------------------------------------------------
 
     def _may_move(self, effect: BoundEffect) -> bool:
-        """Whether nothing of an effect's description needs to be on the GPU, as far as can be told
+        """Whether nothing of an effect's description needs to be on the GPU, as far as is known
         without a trial."""
         described = effect.effect
         if not type(described).__module__.startswith("torchfilm.effects."):
             return False
         if isinstance(described, Rules):
             return False
-        laws = [type(x).__name__ for x in _distributions(described) if not _is_ours(type(x))]
-        if laws:
-            self.kept[effect.title] = f"{laws[0]} is a distribution of your own"
-        return not laws
+        laws = [type(x) for x in parts_of(described, lambda x: isinstance(x, Distribution))]
+        own = [law.__name__ for law in laws if not _is_ours(law)]
+        if own:
+            self.kept[effect.title] = f"{own[0]} is a distribution of your own"
+        return not own
 
     def _trace(self, state: State) -> None:
         """Traces the twins; those that only work on the GPU are dropped, and with one that takes
@@ -297,14 +296,7 @@ class CpuTwins:
     def _try_functions(self, medium: Medium, state: State) -> bool:
         """Whether a derivative may be wanted by what the functions of positions give. Raises what
         one raises on the CPU, at the voxels of a state, and RuntimeError for values elsewhere."""
-        functions: list[Callable[[Tensor], Any]] = []
-
-        def noted(path: str, part: Any) -> Any:
-            if callable(part) and not isinstance(part, (Tensor, type)) and not _is_ours(type(part)):
-                functions.append(part)
-            return part
-
-        mapped(medium, noted)
+        functions = parts_of(medium, _is_function)
         assert state.layout is not None
         at = state.layout.grid.centres() if functions else torch.zeros(0)
         with torch.enable_grad():
@@ -365,13 +357,6 @@ def _is_ours(kind: type) -> bool:
     return kind.__module__.startswith("torchfilm.")
 
 
-def _distributions(description: Any) -> list[Distribution]:
-    found: list[Distribution] = []
-
-    def noted(path: str, part: Any) -> Any:
-        if isinstance(part, Distribution):
-            found.append(part)
-        return part
-
-    mapped(description, noted)
-    return found
+def _is_function(part: Any) -> bool:
+    """Whether it is a function of the user's own; a Schedule can be called, too."""
+    return callable(part) and not isinstance(part, (Tensor, type)) and not _is_ours(type(part))

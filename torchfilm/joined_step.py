@@ -18,11 +18,10 @@ from torchfilm.effects.bound_mechanics import BoundMechanics
 from torchfilm.effects.growth import Growth, wanted_elongation
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.state import State
-from torchfilm.together import Together
 from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.tangents import tracked
 from torchfilm.tools.timing import Timings
-from torchfilm.turns import Turns
+from torchfilm.turns import Part
 
 
 class JoinedStep:
@@ -63,11 +62,9 @@ class JoinedStep:
         return (growth, after) if after.max() < math.inf else None
 
 
-def joined(
-    effects: Sequence[BoundEffect | Turns | Together],
-) -> list[BoundEffect | JoinedStep | Turns | Together]:
+def joined(effects: Sequence[Part]) -> list[Part | JoinedStep]:
     """The effects, in which growth and contacts right after it are joined where they can be."""
-    found: list[BoundEffect | JoinedStep | Turns | Together] = []
+    found: list[Part | JoinedStep] = []
     for effect in effects:
         before = found[-1] if found else None
         if (

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from torchfilm import binding_checks
-from torchfilm.cpu_parts import CpuTwins, OnCpu, Part
+from torchfilm.cpu_parts import CpuTwins, OnCpu
 from torchfilm.effect import BUILT_IN, DIVISION, FLAGGED_DIVISION, Binding, BoundEffect
 from torchfilm.founders import FirstCells
 from torchfilm.initial_cells import Cells
@@ -35,7 +35,7 @@ from torchfilm.tools.threads import after_fork, one_torch_thread
 from torchfilm.tools.times import later
 from torchfilm.tools.timing import Timings
 from torchfilm.tools.warn_once import once
-from torchfilm.turns import in_turns
+from torchfilm.turns import Part, in_turns
 
 if TYPE_CHECKING:
     from torchfilm.scene import Scene

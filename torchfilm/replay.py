@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchfilm.cpu_parts import OnCpu, Part
+from torchfilm.cpu_parts import OnCpu
 from torchfilm.loop import advance
 from torchfilm.model import Model, advanced, bind
 from torchfilm.scene import Scene
@@ -29,6 +29,7 @@ from torchfilm.tools.hot_reload import unchanged
 from torchfilm.tools.ragged import expand_ranges, offsets
 from torchfilm.tools.threads import after_fork, one_torch_thread
 from torchfilm.tools.warn_once import once
+from torchfilm.turns import Part
 
 FIRST = -1  # the part of what happens before all effects
 

@@ -103,8 +103,8 @@ def check_alike(state: State, other: State) -> None:
             (x.grid.spacing, x.periodic, x.height) for x in (state.layout, other.layout)
         )
         if mine != theirs:
-            told = "other's spacing, periodic axes and height"
-            raise checks.input_error(told, theirs, f"{mine}, as this state's medium has", hint)
+            what = "other's spacing, periodic axes and height"
+            raise checks.input_error(what, theirs, f"{mine}, as this state's medium has", hint)
 
 
 def checked_taken(given: Any, places: Tensor, count: int) -> Tensor:

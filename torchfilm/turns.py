@@ -38,14 +38,17 @@ class Turns:
         return state
 
 
-def in_turns(effects: Sequence[BoundEffect]) -> list[BoundEffect | Turns | Together]:
+Part = BoundEffect | Turns | Together  # of a step
+
+
+def in_turns(effects: Sequence[BoundEffect]) -> list[Part]:
     """The effects, in which cells and transport act in turns or together where the medium asks for
     it."""
     media = [e for e in effects if isinstance(e, BoundMedium)]
     joint = media and media[0].solves_together
     circuits = [e for e in effects if isinstance(e, BoundCircuit)]
     circuits = [e for e in circuits if (joins(e, circuits) if joint else e.plan.turns > 1)]
-    found: list[BoundEffect | Turns | Together] = []
+    found: list[Part] = []
     for effect in effects:
         if circuits and effect is circuits[-1]:
             # at the place of the last circuit: what comes after circuits still does

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from torchfilm.tools import checks
-from torchfilm.tools.parts import mapped
+from torchfilm.tools.parts import mapped, parts_of
 from torchfilm.tools.warn_once import warn
 
 # Hours, relative to the time: what times gather by rounding, far below any step.
@@ -146,14 +146,7 @@ def checked_values(name: str, given: Any, check: Callable[[str, Any], Any]) -> A
 
 def schedules(part: Any) -> list[Schedule]:
     """All schedules in a part of a medium."""
-    found: list[Schedule] = []
-
-    def seen(path: str, x: Any) -> Any:
-        found.extend([x] if isinstance(x, Schedule) else [])
-        return x
-
-    mapped(part, seen)
-    return found
+    return parts_of(part, lambda x: isinstance(x, Schedule))
 
 
 def at_time(part: Any, time: float) -> Any:

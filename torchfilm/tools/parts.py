@@ -37,6 +37,18 @@ def mapped(part: Any, change: Callable[[str, Any], Any], path: str = "") -> Any:
     return part
 
 
+def parts_of(part: Any, wanted: Callable[[Any], bool]) -> list[Any]:
+    """Everything in a part, itself included, for which `wanted` is true, in order."""
+    found: list[Any] = []
+
+    def seen(path: str, x: Any) -> Any:
+        found.extend([x] if wanted(x) else [])
+        return x
+
+    mapped(part, seen)
+    return found
+
+
 def keywords(
     owner: str, given: Mapping[str, Any], name: str, options: Collection[str]
 ) -> dict[str, Any]:
