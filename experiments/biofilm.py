@@ -2,11 +2,13 @@
 
     OMP_NUM_THREADS=1 python experiments/biofilm.py                     # half a minute
     OMP_NUM_THREADS=1 python experiments/biofilm.py --hours 8 --picture runs/biofilm.png
+    OMP_NUM_THREADS=1 python experiments/biofilm.py --rest              # a minute
 
 Colonies of the scene `biofilm`, four for each coefficient, run for 20 h. The script prints
 thickness and roughness of the films every five hours, with the standard deviation over colonies,
 and the speed at which it ran. It draws one colony of each coefficient at the end:
-docs/pictures/biofilm.png.
+docs/pictures/biofilm.png. With --rest it prints how thick films are that erode, once they have come
+to rest.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from torchfilm import pictures
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "biofilm.png"
 DIFFUSION, REPLICATES, SEED = (1e3, 3e3, 1e4, 1e5), 4, 0
+EROSION, AT_REST, END = (0.005, 0.01, 0.02, 0.04), 25.0, 40.0  # 1/(µm·h), h, h
 
 
 def in_words(of_colonies: Tensor) -> str:
@@ -32,13 +35,33 @@ def in_words(of_colonies: Tensor) -> str:
     return ", ".join(f"{mean:.2f} ± {spread:.2f}" for mean, spread in both)
 
 
+def at_rest() -> None:
+    """Print the thickness of films that erode, once growth and loss balance."""
+    each = torch.tensor(EROSION).repeat_interleave(REPLICATES)
+    print(f"erosion, 1/(µm·h): {', '.join(f'{x:g}' for x in EROSION)}")
+    for diffusion in DIFFUSION[-2:]:
+        scene = tf.scenes.biofilm(
+            diffusion=diffusion, width=40.0, height=160.0, first=4, erosion=each.tolist()
+        )
+        found = [
+            tf.measure.film(state).thickness
+            for state in tf.simulate(scene, until=END, seed=SEED)
+            if state.time > AT_REST and state.step % 10 == 0
+        ]
+        print(f"diffusion {diffusion:g} µm²/h: thickness {in_words(torch.stack(found).mean(0))} µm")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--hours", type=float, default=20.0)
     parser.add_argument("--picture", type=Path, default=PICTURE)
+    parser.add_argument("--rest", action="store_true", help="films that erode, at rest")
     options = parser.parse_args()
+    if options.rest:
+        at_rest()
+        return
     each = torch.tensor(DIFFUSION).repeat_interleave(REPLICATES)
     scene = tf.scenes.biofilm(diffusion=each.tolist())
     print(f"diffusion, µm²/h: {', '.join(f'{x:g}' for x in DIFFUSION)}")

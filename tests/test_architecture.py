@@ -49,6 +49,7 @@ ROOMS = {
             "torchfilm.reports",
             "torchfilm.cell_types",
             "torchfilm.medium_exchange",
+            "torchfilm.film_shape",
             "torchfilm.rule_values",
             "torchfilm.rule_draws",
             "torchfilm.rule_views",

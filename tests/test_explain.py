@@ -236,7 +236,8 @@ def test_every_effect_that_torchfilm_has_is_known_and_has_words():
         cells.mark = cells.length * 2.0
 
     model = tf.Scene(
-        *BODY[1:],
+        BODY[1],
+        tf.Mechanics(dim=2, walls=[tf.Plane(y=-0.5, facing="+y")]),
         tf.Growth(),
         tf.Monod("ahl"),
         tf.Rules(watching),
@@ -246,6 +247,8 @@ def test_every_effect_that_torchfilm_has_is_known_and_has_words():
         tf.Lysis(rate=0.1),
         tf.MediumReactions(lambda s, p: {"ahl": -s.ahl}),
         tf.Removal((-50, -50), (50, 50)),
+        tf.Erosion(0.01, floor=-50.0, across={"x": (-50, 50)}),
+        tf.Sloughing(),
     ).bind()
     state = model.start()
     assert {type(e.effect) for e in model.effects} == public

@@ -38,6 +38,21 @@ def test_cells_lie_on_a_floor():
     assert float(tf.measure.overlaps(scene.bind(2).start(), [wall]).walls.max()) < 1e-6
 
 
+def test_lengths_are_drawn_or_given():
+    """Cells of all lengths do not divide all at once. Places of one length stay what they were."""
+    spread = tf.inoculum(500, 60.0, length=tf.Uniform(1.0, 3.0), colonies=2)
+    lengths = np.asarray(spread.length).reshape(2, 500)
+    assert lengths.min() >= 1.0 and lengths.max() <= 3.0 and (lengths[0] != lengths[1]).any()
+    np.testing.assert_allclose(lengths.mean(1), 2.0, atol=5 * 2 / np.sqrt(12 * 500))
+    assert spread.overlaps() == []
+    first = tf.inoculum(500, 60.0, length=tf.Uniform(1.0, 3.0))
+    assert np.array_equal(np.asarray(first.length), lengths[0])
+    given = tf.inoculum(3, 20.0, length=[1.0, 2.0, 3.0], colonies=2)
+    assert np.asarray(given.length).tolist() == [1.0, 2.0, 3.0] * 2
+    one, other = tf.inoculum(30, 15.0), tf.inoculum(30, 15.0, length=[2.0] * 30)
+    assert np.array_equal(np.asarray(one.position), np.asarray(other.position))
+
+
 def test_shares_of_types():
     cells = tf.inoculum(31, radius=30.0, types={0: 0.9, 2: 0.1}, colonies=5, seed=1)
     kinds = cells.cell_type.reshape(5, 31)
@@ -80,6 +95,11 @@ def test_colonies_grow_from_it():
         ({"dim": 3, "floor": np.inf}, "floor = inf"),
         ({"colonies": 0}, "colonies = 0"),
         ({"length": -1.0}, "length = -1"),
+        ({"length": tf.Uniform(-1.0, 2.0)}, "length.low = -1.0 is not allowed"),
+        ({"length": tf.Uniform([1.0, 2.0], 3.0)}, "length.low"),
+        ({"length": tf.Normal(2.0, 0.1)}, "length = Normal.*one length for each of the 30 cells"),
+        ({"length": [1.0, 2.0]}, "one length for each of the 30 cells, each finite"),
+        ({"length": "2"}, "length = '2' is not allowed"),
         ({"fractions": {0: 1.0}}, "no parameter 'fractions'"),
     ],
 )

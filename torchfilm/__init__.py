@@ -10,6 +10,7 @@ from torchfilm.distributions import LogNormal, Normal, Uniform
 from torchfilm.effect import Effect
 from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
+from torchfilm.effects.erosion import Erosion
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.lysis import Lysis
 from torchfilm.effects.mechanics import Mechanics
@@ -20,6 +21,7 @@ from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
 from torchfilm.effects.signal import Signal
+from torchfilm.effects.sloughing import Sloughing
 from torchfilm.initial_cells import Cells
 from torchfilm.inocula import inoculum
 from torchfilm.loop import advance, failures
@@ -86,6 +88,7 @@ __all__ = [
     "Dirichlet",
     "Division",
     "Effect",
+    "Erosion",
     "Field",
     "Groups",
     "Growth",
@@ -117,6 +120,7 @@ __all__ = [
     "Settings",
     "Signal",
     "SimulationError",
+    "Sloughing",
     "Sphere",
     "State",
     "Timings",

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 # that divide at a threshold: they do so in the step in which they get there, not in the next one.
 RULES, FLAGGED_DIVISION, FIRST_REACTIONS, BEFORE_CELLS, NUTRITION, MOTILITY = 10, 20, 21, 22, 25, 28
 GROWTH, MECHANICS, GRID_COVERAGE, CIRCUIT, TRANSPORT, LAST_REACTIONS = 30, 40, 45, 50, 60, 65
-LYSIS, DIVISION, REMOVAL = 70, 80, 90
+LYSIS, DIVISION, REMOVAL, SLOUGHING = 70, 80, 90, 92
 
 GEOMETRY = ("position", "axis", "length", "radius")
 # Names that every state has and an effect may read or write beside declared fields.

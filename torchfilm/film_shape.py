@@ -1,9 +1,11 @@
-"""The shape of a biofilm on a floor: its height above each place of the floor."""
+"""The shape of a biofilm on a floor: its height above each place of the floor, and what is on
+top."""
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,8 +16,6 @@ from torchfilm.state import State
 from torchfilm.tools import checks
 
 AXES = "xyz"
-# A cell is a row of spheres, this share of its radius apart: its top is found to a few nanometres.
-APART = 0.25
 
 
 @dataclass(frozen=True)
@@ -32,90 +32,144 @@ class Film:
     coverage: Tensor
 
 
+@dataclass(frozen=True)
+class Floor:
+    """A floor in columns: along each of its axes the ends, how many columns, and whether the last
+    is beside the first. at: its y in the plane, or z in space, µm."""
+
+    spans: tuple[tuple[float, float], ...]
+    counts: tuple[int, ...]
+    periodic: tuple[bool, ...]
+    at: float
+
+    @staticmethod
+    def of(
+        name: str, state: State, spacing: float, at: float,
+        across: Mapping[str, tuple[float, float]] | None, of_medium: bool = True,
+    ) -> Floor:  # fmt: skip
+        """The floor of a state's colonies. across: see `measure.film`. of_medium: whether it may be
+        as wide as the box of the medium. Raises InputError, which names `name`."""
+        ground, upward = AXES[: state.dim - 1], AXES[state.dim - 1]
+        faces = {} if state.space is None else state.space.faces
+        if upward in faces:
+            raise checks.InputError(
+                f"{name} goes by height along {upward}, and space is periodic there: there is no"
+                " floor."
+            )
+        found = {**(_of_medium(state, ground) if of_medium else {}), **faces}
+        given = checked_spans(f"{name}(across)", {} if across is None else across, ground)
+        for axis, span in given.items():
+            if faces.get(axis, span) != span:
+                rule = f"left out along {axis}, where space is periodic"
+                raise checks.input_error(f"{name}(across)", across, rule)
+            found[axis] = span
+        if missing := [a for a in ground if a not in found]:
+            medium = ", and there is no medium that is as wide in all colonies" if of_medium else ""
+            raise checks.InputError(
+                f"{name} does not know how far the floor reaches along {' and '.join(missing)}:"
+                f" space is not periodic there{medium}. Give it, such as"
+                f" across={{{missing[0]!r}: (0, 40)}}."
+            )
+        spans = tuple(found[a] for a in ground)
+        counts = [max(1, math.ceil((high - low) / spacing - 1e-9)) for low, high in spans]
+        return Floor(spans, tuple(counts), tuple(a in faces for a in ground), at)
+
+    @property
+    def steps(self) -> list[float]:
+        """How wide a column is along each axis, µm."""
+        ends = zip(self.spans, self.counts, strict=True)
+        return [(high - low) / count for (low, high), count in ends]
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Where cells meet the middles of columns. place: (M,), the column, of all colonies one after
+    the other. cell: (M,). top: (M,) float64, how high the cell reaches there, µm above the floor.
+    inside: (N,) bool, whether a cell's centre is above the floor's columns. size: how many columns
+    there are."""
+
+    place: Tensor
+    cell: Tensor
+    top: Tensor
+    inside: Tensor
+    size: int
+
+    def height(self) -> Tensor:
+        """Of the highest cell above the middle of each column, (size,) float64; 0 where there is
+        none."""
+        return self.top.new_zeros(self.size).scatter_reduce(0, self.place, self.top, "amax")
+
+
 def film_of(
     state: State, spacing: float, floor: float, across: Mapping[str, tuple[float, float]] | None
 ) -> Film:
     """See `measure.film`."""
-    ground, upward = AXES[: state.dim - 1], AXES[state.dim - 1]
-    if state.space is not None and upward in state.space.faces:
-        raise checks.InputError(
-            f"film measures height along {upward}, and space is periodic there: there is no floor."
-        )
-    spans = _spans(state, ground, across)
-    counts = [max(1, math.ceil((high - low) / spacing - 1e-9)) for low, high in spans]
-    steps = [(high - low) / count for (low, high), count in zip(spans, counts, strict=True)]
-    points, radius, colony = _spheres(state)
-    spread = [int((float(radius.max()) if len(radius) else 0.0) / step) + 1 for step in steps]
-    nearest = [
-        torch.floor((points[:, k] - low) / step).long()
-        for k, ((low, _), step) in enumerate(zip(spans, steps, strict=True))
-    ]
-    periodic = [state.space is not None and a in state.space.faces for a in ground]
-    columns = torch.cartesian_prod(*[torch.arange(-s, s + 1, device=state.device) for s in spread])
-    size = state.colonies * math.prod(counts)
-    height = points.new_zeros(size)
-    for offset in columns.reshape(-1, len(counts)):
-        place, apart = colony, torch.zeros_like(radius)
-        inside = torch.ones_like(colony, dtype=torch.bool)
-        for k, ((low, _), step, count) in enumerate(zip(spans, steps, counts, strict=True)):
-            column = nearest[k] + offset[k]
-            apart = apart + (low + (column + 0.5) * step - points[:, k]) ** 2
-            if not periodic[k]:
-                inside &= (column >= 0) & (column < count)
-            place = place * count + column % count
-        rise = radius * radius - apart
-        meets = inside & (rise >= 0)
-        top = points[meets, state.dim - 1] + rise[meets].sqrt() - floor
-        height = height.scatter_reduce(0, place[meets], top, "amax")
-    height = height.reshape(state.colonies, *counts)
+    where = Floor.of("film", state, spacing, floor, across)
+    height = columns_of(state, where).height().reshape(state.colonies, *where.counts)
     flat = height.flatten(1)
     thickness = flat.mean(1)
     roughness = (flat - thickness.unsqueeze(1)).abs().mean(1) / thickness
     return Film(height, thickness, roughness, (flat > 0).double().mean(1))
 
 
-def _spans(
-    state: State, ground: str, across: Mapping[str, tuple[float, float]] | None
-) -> list[tuple[float, float]]:
-    """From where to where the floor is measured, along each of its axes, µm."""
-    found: dict[str, tuple[float, float]] = {}
-    if state.layout is not None:
-        grid = state.layout.grid
-        step = torch.tensor(grid.spacing, dtype=torch.float64, device=state.device)
-        low, high = grid.origin, grid.origin + grid.shape * step
-        for k, axis in enumerate(ground):
-            if bool((low[:, k] == low[0, k]).all() & (high[:, k] == high[0, k]).all()):
-                found[axis] = float(low[0, k]), float(high[0, k])
-    found |= {} if state.space is None else state.space.faces
-    for axis, span in checked_spans(
-        "film(across)", {} if across is None else across, ground
-    ).items():
-        faces = {} if state.space is None else state.space.faces
-        if faces.get(axis, span) != span:
-            rule = f"left out along {axis}, where space is periodic"
-            raise checks.input_error("film(across)", across, rule)
-        found[axis] = span
-    if missing := [a for a in ground if a not in found]:
-        raise checks.InputError(
-            f"film does not know how far the floor reaches along {' and '.join(missing)}: space is"
-            " not periodic there, and there is no medium that is as wide in all colonies. Give it,"
-            f" such as across={{{missing[0]!r}: (0, 40)}}."
-        )
-    return [found[a] for a in ground]
+def columns_of(state: State, floor: Floor) -> Columns:
+    """Where the cells of a state meet the columns of a floor, above it."""
+    half, radius, axis = 0.5 * state.length.double(), state.radius.double(), state.axis.double()
+    inside = torch.ones_like(state.colony, dtype=torch.bool)
+    firsts, numbers = [], []  # of the columns whose middle is within what a cell takes up
+    for k, ((low, high), step) in enumerate(zip(floor.spans, floor.steps, strict=True)):
+        x, wide = state.position[:, k], half * axis[:, k].abs() + radius
+        firsts.append(torch.ceil((x - wide - low) / step - 0.5).long())
+        last = torch.floor((x + wide - low) / step - 0.5).long()
+        numbers.append((last - firsts[k] + 1).clamp(min=0))
+        if not floor.periodic[k]:
+            inside &= (x >= low) & (x < high)
+    each = functools.reduce(torch.mul, numbers)
+    cell = torch.repeat_interleave(torch.arange(state.cells, device=state.device), each)
+    pick = lambda x: x.index_select(0, cell)
+    rank = torch.arange(len(cell), device=state.device) - pick(torch.cumsum(each, 0) - each)
+    place, there, away = pick(state.colony), torch.ones_like(cell, dtype=torch.bool), []
+    for k, ((low, _), step) in enumerate(zip(floor.spans, floor.steps, strict=True)):
+        number, count = pick(numbers[k]), floor.counts[k]
+        column, rank = pick(firsts[k]) + rank % number, rank // number
+        away.append(low + (column + 0.5) * step - pick(state.position[:, k]))
+        if not floor.periodic[k]:
+            there &= (column >= 0) & (column < count)
+        place = place * count + column % count
+    top = pick(state.position[:, -1]) + _top(away, pick(axis), pick(half), pick(radius)) - floor.at
+    meets = torch.nonzero(there & (top > 0)).squeeze(1)  # a NaN is not above 0
+    size = state.colonies * math.prod(floor.counts)
+    return Columns(place[meets], cell[meets], top[meets], inside, size)
 
 
-def _spheres(state: State) -> tuple[Tensor, Tensor, Tensor]:
-    """Spheres in a row that make up the cells: places (P, d), radii (P,), colonies (P,)."""
-    length, radius = state.length.double(), state.radius.double()
-    parts = torch.ceil(length / (APART * radius)).long() + 1
-    owner = torch.repeat_interleave(torch.arange(state.cells, device=state.device), parts)
-    first = torch.cumsum(parts, 0) - parts
-    rank = torch.arange(len(owner), device=state.device) - first.index_select(0, owner)
-    share = rank / (parts.index_select(0, owner) - 1).clamp(min=1) - 0.5
-    along = (share * length.index_select(0, owner)).unsqueeze(1)
-    pick = lambda x: x.index_select(0, owner)
-    return (
-        pick(state.position) + along * pick(state.axis.double()),
-        pick(radius),
-        pick(state.colony),
-    )
+def _top(away: Sequence[Tensor], axis: Tensor, half: Tensor, radius: Tensor) -> Tensor:
+    """How high above its centre a cell reaches on an upright line, (M,) µm; NaN where it does not
+    meet it. away: from the centre to the line along each axis of the ground, (M,).
+
+    It is the highest of the points t·a_z + √(r² − |d − t·a_xy|²) for t along the centreline, with
+    the line at d. With p along the cell's ground track, of length s for each unit of t, and R² = r²
+    − |d|² + p² for what is across it, that is where p − s·t = −a_z·R, or at an end.
+    """
+    upward = axis[:, -1]
+    track = (1.0 - upward * upward).clamp(min=0.0).sqrt()
+    lies = track > 1e-9  # else it stands upright, and its track is a point
+    one = torch.where(lies, track, 1.0)
+    p = functools.reduce(torch.add, (d * axis[:, k] for k, d in enumerate(away))) / one
+    p = torch.where(lies, p, 0.0)
+    square = radius * radius - functools.reduce(torch.add, (d * d for d in away)) + p * p
+    across = square.clamp(min=0.0).sqrt()
+    t = torch.where(lies, (p + upward * across) / one, torch.copysign(half, upward))
+    t = torch.minimum(torch.maximum(t, -half), half)
+    u = p - track * t
+    return t * upward + (square - u * u).sqrt()
+
+
+def _of_medium(state: State, ground: str) -> dict[str, tuple[float, float]]:
+    """The ends of the box of the medium, along the axes on which it is as wide in all colonies."""
+    if state.layout is None:
+        return {}
+    grid = state.layout.grid
+    step = torch.tensor(grid.spacing, dtype=torch.float64, device=state.device)
+    low, high = grid.origin, grid.origin + grid.shape * step
+    alike = lambda k: bool((low[:, k] == low[0, k]).all() & (high[:, k] == high[0, k]).all())
+    return {a: (float(low[0, k]), float(high[0, k])) for k, a in enumerate(ground) if alike(k)}

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from torchfilm.distributions import Uniform
 from torchfilm.initial_cells import Cells
 from torchfilm.physics.nearby import gaps_nearby
 from torchfilm.tools import checks
+from torchfilm.values import Distribution
 
 ROUNDS = 2000  # in which cells that overlap others are placed again
 
@@ -22,7 +25,7 @@ def inoculum(
     types: Mapping[int, float] | None = None,
     colonies: int = 1,
     dim: int = 2,
-    length: float = 2.0,
+    length: float | Uniform | Sequence[float] | np.ndarray | Tensor = 2.0,
     cell_radius: float = 0.5,
     floor: float | None = None,
     seed: int = 0,
@@ -33,9 +36,11 @@ def inoculum(
 
     radius: of the disc, in 3-D the ball, that contains their centres, µm. types: the share of each
     cell type, which together are 1; each colony has these shares, as near as whole numbers of cells
-    come to them, and who is of which type is drawn. dim: 2 or 3. length: of the centreline, µm;
-    cell_radius: µm. floor: in 3-D, µm: cells lie flat on a floor at this z, in a disc around the z
-    axis, instead of in a ball. No two cells overlap. Colony k is the same whatever their number.
+    come to them, and who is of which type is drawn. dim: 2 or 3. length: of the centreline, µm: one
+    number; tf.Uniform(2, 4) to draw each, since cells of one length divide all at once; or one for
+    each of `count` cells, the same in all colonies. cell_radius: µm. floor: in 3-D, µm: cells lie
+    flat on a floor at this z, in a disc around the z axis, instead of in a ball. No two cells
+    overlap. Colony k is the same whatever their number.
     Raises InputError for shares that do not sum to 1, and where the cells do not find room: rods
     placed one after the other at random fill at most about 45 % of an area, 30 % of a volume.
     """
@@ -43,7 +48,7 @@ def inoculum(
     checks.number("radius", radius, least=0.0)
     checks.integer("colonies", colonies, least=1)
     checks.choice("dim", dim, (2, 3))
-    checks.number("length", length, least=0.0)
+    lengths = _lengths(length, count, colonies, seed)
     checks.number("cell_radius", cell_radius, above=0.0)
     checks.integer("seed", seed, least=0)
     if floor is not None:
@@ -52,7 +57,7 @@ def inoculum(
             raise checks.input_error("floor", floor, "left out with dim=2", "Take dim=3.")
     shares, placed_in = _shares(types), 2 if floor is not None else dim
     made = [
-        _colony(np.random.default_rng([seed, k]), count, radius, placed_in, length, cell_radius)
+        _colony(np.random.default_rng([seed, k]), radius, placed_in, lengths[k], cell_radius)
         for k in range(colonies)
     ]
     if floor is not None:
@@ -61,11 +66,29 @@ def inoculum(
     return Cells(
         np.concatenate([position for position, _ in made]),
         np.concatenate([axis for _, axis in made]),
-        length,
+        lengths.reshape(-1),
         cell_radius,
         cell_type=None if shares is None else np.concatenate(kinds),
         colony=None if colonies == 1 else np.repeat(np.arange(colonies), count),
     )
+
+
+def _lengths(given: object, count: int, colonies: int, seed: int) -> np.ndarray:
+    """The length of each cell, (colonies, count), checked."""
+    if isinstance(given, Uniform):
+        low = checks.number("length.low", given.low, least=0.0)
+        high = checks.number("length.high", given.high, least=0.0)
+        draws = (np.random.default_rng([seed, k, 2]).random(count) for k in range(colonies))
+        return low + (high - low) * np.stack(list(draws))
+    rule = f"a number, tf.Uniform(2, 4), or one length for each of the {count} cells"
+    if isinstance(given, Distribution | Mapping | str):
+        raise checks.input_error("length", given, rule)
+    if np.ndim(given) == 0:  # type: ignore[arg-type]
+        return np.full((colonies, count), checks.number("length", given, least=0.0))
+    each = np.asarray(given, np.float64)
+    if each.shape != (count,) or not (each >= 0).all() or not np.isfinite(each).all():
+        raise checks.input_error("length", given, f"{rule}, each finite and at least 0")
+    return np.tile(each, (colonies, 1))
 
 
 def _shares(types: object) -> dict[int, float] | None:
@@ -97,9 +120,10 @@ def _types(rng: np.random.Generator, count: int, shares: dict[int, float] | None
 
 
 def _colony(
-    rng: np.random.Generator, count: int, radius: float, dim: int, length: float, cell_radius: float
+    rng: np.random.Generator, radius: float, dim: int, length: np.ndarray, cell_radius: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and axes of the cells of a colony, (count, dim) each."""
+    """Positions and axes of the cells of a colony, (count, dim) each; length: (count,)."""
+    count = len(length)
     position, axis = np.empty((count, dim)), np.empty((count, dim))
     again = np.arange(count)
     for _ in range(ROUNDS):
@@ -110,10 +134,11 @@ def _colony(
         again = _overlapping(position, axis, length, cell_radius, again)
         if not again.size:
             return position, axis
+    mean = length.mean()
     raise checks.input_error(
         "radius", radius, "wide enough for the cells",
-        f"{count} cells of length {length:g} and radius {cell_radius:g} µm would fill"
-        f" {_filled(count, radius, dim, length, cell_radius):.0%} of it, and did not find room in"
+        f"{count} cells of length {mean:g} and radius {cell_radius:g} µm would fill"
+        f" {_filled(count, radius, dim, mean, cell_radius):.0%} of it, and did not find room in"
         f" {ROUNDS} rounds: give a greater radius, or fewer cells.",
     )  # fmt: skip
 
@@ -134,14 +159,14 @@ def _lying(position: np.ndarray, axis: np.ndarray, z: float) -> tuple[np.ndarray
 
 
 def _overlapping(
-    position: np.ndarray, axis: np.ndarray, length: float, radius: float, new: np.ndarray
+    position: np.ndarray, axis: np.ndarray, length: np.ndarray, radius: float, new: np.ndarray
 ) -> np.ndarray:
     """Which of the `new` cells overlap one that was there, or a new one before them."""
     count = len(position)
-    same = lambda x: torch.full((count,), x, dtype=torch.float64)
+    wide = torch.full((count,), radius, dtype=torch.float64)
     one = torch.zeros(count, dtype=torch.int64)
     first, second, gap = gaps_nearby(
-        torch.from_numpy(position), torch.from_numpy(axis), same(length), same(radius), one, 1
+        torch.from_numpy(position), torch.from_numpy(axis), torch.from_numpy(length), wide, one, 1
     )
     is_new = torch.zeros(count, dtype=torch.bool)
     is_new[new] = True

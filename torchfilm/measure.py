@@ -19,6 +19,7 @@ from torchfilm.physics.surfaces import FlatSurface
 from torchfilm.physics.walls import Wall, depth_in_walls
 from torchfilm.state import CELL, State
 from torchfilm.tools import checks
+from torchfilm.tools.connected import components
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.vectors import safe_norm
@@ -381,8 +382,7 @@ def clusters(state: State, gap: float, name: str | None = None) -> Tensor:
         kind = _kinds("clusters", state, name)
         alike = kind[first] == kind[second]
         first, second = first[alike], second[alike]
-    pairs = (torch.ones(len(first)).numpy(), (first.cpu().numpy(), second.cpu().numpy()))
-    of = torch.from_numpy(_hanging_together(pairs, state.cells)).to(state.device)
+    of = components(first, second, state.cells)
     sizes = torch.bincount(of)
     # their first cells: of several writes to one place torch keeps any, of a minimum the least
     number = torch.arange(state.cells, device=state.device)
@@ -395,16 +395,6 @@ def clusters(state: State, gap: float, name: str | None = None) -> Tensor:
     rank = torch.empty_like(place)
     rank[order] = place - torch.searchsorted(colony, colony)
     return rank[of]
-
-
-def _hanging_together(pairs: tuple[Any, tuple[Any, Any]], cells: int) -> Any:
-    """The number of the connected component of each cell, an array (N,) of int64."""
-    # imported where it is used: it takes longer to load than torchfilm itself
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    _, of = connected_components(coo_array(pairs, shape=(cells, cells)), directed=False)
-    return of.astype("int64")
 
 
 @of_a_state

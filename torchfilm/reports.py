@@ -8,6 +8,8 @@ from typing import Protocol
 
 import torch
 
+from torchfilm.state import State
+
 
 class Report(Protocol):
     """What a step of an effect tells of itself. A driver raises, or drops colonies, where `status`
@@ -23,6 +25,31 @@ class Report(Protocol):
 
     def reason(self, place: int) -> str:
         """What went wrong in the colony at this place of the batch."""
+
+
+@dataclass(frozen=True)
+class CellsLost:
+    """Cells that left in a step: `cells` (B,), their number, and `volume` (B,), float64 µm³."""
+
+    cells: torch.Tensor
+    volume: torch.Tensor
+    hint = ""
+
+    @staticmethod
+    def of(state: State, gone: torch.Tensor) -> CellsLost:
+        """Of those where `gone` (N,) is true."""
+        volume = torch.where(gone, state.volume.detach().double(), 0.0)
+        lost = torch.bincount(state.colony[gone], minlength=state.colonies)
+        return CellsLost(lost, state.groups.sum(volume))
+
+    @property
+    def status(self) -> torch.Tensor:
+        """All is well."""
+        return torch.zeros_like(self.cells)
+
+    def reason(self, place: int) -> str:
+        """Nothing has gone wrong."""
+        return ""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ from torchfilm.tools import checks, displays, random, row_checks, tangents
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.read_only import read_only
 
-FATES = ("divided", "removed", "left", "failed", "lysed")  # why cells leave a state
+# why cells leave a state
+FATES = ("divided", "removed", "left", "failed", "lysed", "eroded", "sloughed")
 # Signals stand among the fields under "out.NAME", beside what cells hold under the same name.
 OUTSIDE = "out."
 
@@ -85,8 +86,7 @@ class Births:
 
 @dataclass(frozen=True)
 class Ended:
-    """Cells that left in one step: colony ids and uids (M,) int64, and why ("divided", "removed",
-    "left", "failed", "lysed")."""
+    """Cells that left in one step: colony ids and uids (M,) int64, and why, of `FATES`."""
 
     colony_id: Tensor
     uid: Tensor

@@ -144,9 +144,9 @@ def checked(name: str, given: object, rule: Rule, forms: str = FORMS) -> Any:
                     f"{name}, cell type", kind, "an integer from 0", "Write {0: 0.6, 1: 1.2}."
                 )
         if not given:
-            raise checks.input_error(
-                name, dict(given), "one value for each cell type, such as {0: 0.6, 1: 1.2}"
-            )
+            each = "one value for each cell type, such as {0: 0.6, 1: 1.2}"
+            raise checks.input_error(name, dict(given), each)
+        _check_no_schedules(name, given, rule)
         by_type = ByType(
             {
                 int(k): checked(f"{name}[{k}]", value, rule, FORMS_OF_TYPE)
@@ -171,6 +171,18 @@ def checked(name: str, given: object, rule: Rule, forms: str = FORMS) -> Any:
     if rule.scope == CELL:
         _warn_of_range(name, given)
     return checks.value(name, given, hint=hint, **bounds)
+
+
+def _check_no_schedules(name: str, by_type: Mapping[int, Any], rule: Rule) -> None:
+    """Raises InputError where the value of a cell type is a schedule, though a schedule of values
+    by type may be."""
+    for kind, value in by_type.items():
+        if rule.scheduled and isinstance(value, Schedule):
+            types = "{" + ", ".join(f"{k}: …" for k in by_type) + "}"
+            raise checks.input_error(
+                f"{name}[{kind}]", value, "constant in a dict by cell type",
+                f"Put the types into the schedule: tf.Schedule({{0: {types}, 2.5: {types}}}).",
+            )  # fmt: skip
 
 
 def _checked_in_schedule(rule: Rule, name: str, given: Any) -> Any:

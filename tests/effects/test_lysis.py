@@ -127,6 +127,56 @@ def test_a_schedule_of_the_rate():
             pass
 
 
+def test_a_factor_multiplies_the_rate():
+    def choose(cells):
+        cells.weak = (cells.uid % 2).float()
+
+    many = tf.Cells([[9.0 * k, 0.0] for k in range(4000)], [[0.0, 1.0]] * 4000)
+    scene = tf.Scene(
+        tf.Rules(choose, variables={"weak": 0.0}), tf.Lysis(rate=0.7, factor="weak"),
+        founders=many, dim=2,
+    )  # fmt: skip
+    *_, state = tf.simulate(scene, until=2.0, dt=0.1, seed=5)
+    odd, left = int((state.uid % 2).sum()), math.exp(-1.4)
+    assert state.cells - odd == 2000
+    assert odd == pytest.approx(2000 * left, abs=5 * (2000 * left * (1 - left)) ** 0.5)
+
+
+@pytest.mark.parametrize("dt", [0.05, 0.2])
+def test_cells_die_by_what_they_meet_in_the_whole_step(dt, device, dtype):
+    """A drug that decays by itself at 6/h kills at the rate 4·drug: whatever the step, a cell lives
+    with exp(−∫ 4·drug dt). The rate as a step begins would let 0.03 % live where 27 % do (0.2 h).
+    """
+
+    def kills(u, s, p, cell):
+        return {"drug": -6.0 * u.drug, "dying": 4.0 * u.drug}
+
+    many = tf.Cells([[9.0 * k, 0.0] for k in range(4000)], [[0.0, 1.0]] * 4000)
+    scene = tf.Scene(
+        tf.Circuit(
+            kills, species=["drug", "dying"], initial={"drug": 2.0}, rtol=1e-6, dilution=False
+        ),
+        tf.Lysis(hazard="dying"), founders=many, dim=2,
+    )  # fmt: skip
+    state = scene.bind(device=device, dtype=dtype).start(seed=2)
+    for number in range(1, round(1.0 / dt) + 1):
+        state = step(scene, state, dt)
+        assert not state.dying.any()
+        left = math.exp(-4.0 * 2.0 * (1 - math.exp(-6.0 * number * dt)) / 6.0)
+        assert state.cells == pytest.approx(4000 * left, abs=5 * (4000 * left * (1 - left)) ** 0.5)
+
+
+def test_a_hazard_that_is_no_number_is_a_failure():
+    def nothing(cells):
+        cells.dying = cells.dying / 0.0
+
+    scene = tf.Scene(
+        tf.Rules(nothing, variables={"dying": 0.0}), tf.Lysis(hazard="dying"), founders=FOUR, dim=2
+    )
+    with pytest.raises(tf.SimulationError, match="dying"):
+        next(iter(tf.simulate(scene, until=0.2)))
+
+
 @pytest.mark.parametrize("when", ["length", "volume"])
 def test_large_cells_burst(when):
     cells = tf.Cells(FOUR.position, FOUR.axis, length=[1.0, 2.0, 3.0, 4.0])
@@ -339,7 +389,10 @@ def test_a_search_grows_each_design_anew():
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({}, "neither `when` nor `rate`"),
+        ({}, "none of `when`, `rate` and `hazard`"),
+        ({"hazard": "toxin", "rate": 1.0}, "Lysis.rate = 1.0 is not allowed: it must be left out"),
+        ({"hazard": "a b"}, "Lysis.hazard = 'a b' is not allowed: it must be the name of a spec"),
+        ({"when": "a", "factor": "b"}, "Lysis.factor = 'b' .* given with rate, which it mult"),
         ({"rate": 1.0, "above": 3.0}, "Lysis.above = 3.0 is not allowed: it must be given with"),
         ({"when": "a", "releases": {"a": ("b", "b")}}, "a tuple of different names"),
         ({"when": "radius"}, "Lysis.when = 'radius' .*of a cell's shape"),
@@ -365,6 +418,8 @@ def test_bad_input(given, words):
             {"when": "toxn"},
             r"lysis needs the field 'toxn'.*Did you mean 'toxin'.*variables=\{'toxn': 0.0\}",
         ),
+        ({"rate": 1.0, "factor": "toxn"}, "lysis needs the field 'toxn'.*Did you mean 'toxin'"),
+        ({"hazard": "toxn"}, "lysis needs the field 'toxn'.*Did you mean 'toxin'"),
         ({"when": "toxin", "releases": {"colicin": "toxin"}}, "the Medium has toxin, ahl"),
         ({"when": "toxin", "releases": {"toxin": "colicin"}}, "lysis needs the field 'colicin'"),
         ({"when": "age"}, "variable of rules"),

@@ -375,3 +375,72 @@ def test_growth_is_asked_for_where_it_is_missing():
     medium = tf.Medium(food=tf.Signal(diffusion=1.0), box=((-8, -8), (8, 8)), spacing=4.0)
     with pytest.raises(tf.InputError, match=r"needs the field 'growth_rate'.*List tf.Growth\(\)"):
         tf.Scene(tf.Monod("food"), medium, dim=2)
+
+
+# --- maintenance ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("steps", [1, 4])
+def test_maintenance_is_taken_off_the_growth_and_not_off_the_uptake(steps, device, dtype):
+    """At a concentration that stays, u = rate · s/(half + s) in each type: growth is max(0, u − m),
+    what lacks max(0, m − u), and what is eaten ∫ u V dt / yield of the growing volume."""
+    m = {0: 0.0, 1: 0.1, 2: 0.4}
+    monod = tf.Monod("food", rate=0.6, half=1.0, growth_yield=2.0, maintenance=m)
+    cells = tf.Cells([[-5.0, 0.0], [0.0, 0.0], [5.0, 0.0]], [[0.0, 1.0]] * 3, cell_type=[0, 1, 2])
+    food = tf.Signal(diffusion=0.0, initial=0.5, reservoir=0.5)
+    scene = tf.Scene(
+        monod, tf.Growth(),
+        tf.Medium(food=food, outside="reservoir", steps=steps, box=((90.0, 90.0), (92.0, 92.0)),
+                  spacing=2.0, depth=1.0),
+        founders=cells,
+    )  # fmt: skip
+    state = scene.bind(device=device, dtype=dtype).start()
+    first = state.volume.double()
+    state = advance(scene, state, 10, dt=0.1)
+    u, each = 0.2, torch.tensor([0.0, 0.1, 0.4], dtype=F64)
+    net = (u - each).clamp(min=0.0)
+    close = {"rtol": 1e-5, "atol": 1e-6, "check_dtype": False}
+    torch.testing.assert_close(state.growth_rate.cpu(), net, **close)
+    torch.testing.assert_close(state.starvation.cpu(), (each - u).clamp(min=0.0), **close)
+    torch.testing.assert_close(state.volume.cpu(), first.cpu() * torch.exp(net), **close)
+    ratio = torch.where(net > 0, torch.expm1(net) / torch.where(net > 0, net, 1.0), 1.0)
+    eaten = u * first.cpu() * ratio / 2.0
+    # of the second order in m · dt where cells grow, of the first where they starve
+    torch.testing.assert_close(
+        state.food_eaten[:2].cpu(), eaten[:2], rtol=1e-3, atol=0, check_dtype=False
+    )
+    assert float(state.food_eaten[2]) == pytest.approx(float(eaten[2]), rel=0.4 * 0.1 / 2 / steps)
+
+
+def test_those_that_starve_die():
+    """Food for a while only: cells that take up less than their maintenance burst, at their rate,
+    and what they leave feeds no one else."""
+    many = tf.Cells([[x, y] for x in range(-7, 8) for y in range(-7, 8)], [[0.0, 1.0]] * 225, 0.0,
+                    radius=0.3)  # fmt: skip
+    scene = eating(
+        tf.Monod("food", rate=1.0, half=0.1, growth_yield=1.0, maintenance=0.05),
+        cells=many, initial=0.2, diffusion=100.0, more=(tf.Lysis(when="starvation", rate=0.5),),
+    )  # fmt: skip
+    lived = []
+    for state in tf.simulate(scene, until=8.0, dt=0.1):
+        lived.append((float(state.starvation.max()), state.cells))
+    fed = [cells for hunger, cells in lived if hunger == 0.0]
+    assert len(fed) > 5 and set(fed) == {225}
+    late = len(lived) - len(fed)
+    wanted = 225 * math.exp(-0.5 * 0.1 * late)
+    assert lived[-1][1] == pytest.approx(wanted, abs=5 * (wanted * (1 - wanted / 225)) ** 0.5)
+
+
+def test_gradients_go_through_maintenance():
+    need = torch.tensor([0.1], dtype=F64, requires_grad=True)
+    scene = eating(tf.Monod("food", rate=1.0, half=0.5, maintenance=need), initial=0.5)
+    state = advance(scene, scene.bind(dtype=F64).start(), 4)
+    (slope,) = torch.autograd.grad(state.volume.sum(), need)
+    more, less = (
+        float(advance(s, s.bind(dtype=F64).start(), 4).volume.sum())
+        for s in (
+            eating(tf.Monod("food", rate=1.0, half=0.5, maintenance=0.1 + d), initial=0.5)
+            for d in (1e-4, -1e-4)
+        )
+    )
+    assert float(slope) == pytest.approx((more - less) / 2e-4, rel=1e-5) and float(slope) < -0.1

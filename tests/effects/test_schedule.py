@@ -380,3 +380,17 @@ def test_each_value_has_one_number_for_each_colony():
     scene = grown(medium(tf.Schedule({0: 1.0, 1: tf.PerColony([1.0, 2.0, 3.0])}), "source"))
     with pytest.raises(tf.InputError, match=r"Medium.signals\['food'\].source"):
         scene.bind(colonies=2)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda given: tf.Lysis(rate=given),
+        lambda given: tf.Rules(lambda cells: None, parameters={"rate": given}),
+        lambda given: tf.Motility(speed=1.0, reversals=given),
+    ],
+)
+def test_types_go_into_a_schedule_and_not_schedules_into_types(make):
+    with pytest.raises(tf.InputError, match=r"\[1\] = Schedule.*tf.Schedule\(\{0: \{0: …, 1: …\}"):
+        make({0: 1.0, 1: tf.Schedule({0: 0.0, 1: 2.0})})
+    make(tf.Schedule({0: {0: 1.0, 1: 0.0}, 1: {0: 1.0, 1: 2.0}}))

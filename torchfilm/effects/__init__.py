@@ -3,6 +3,7 @@ only."""
 
 from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
+from torchfilm.effects.erosion import Erosion
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.lysis import Lysis
 from torchfilm.effects.mechanics import Mechanics
@@ -12,6 +13,7 @@ from torchfilm.effects.motility import Motility
 from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
+from torchfilm.effects.sloughing import Sloughing
 
 # In the order of a step, by the names that `explain` uses.
 KNOWN = {
@@ -26,4 +28,6 @@ KNOWN = {
     "lysis": Lysis,
     "division": Division,
     "removal": Removal,
+    "erosion": Erosion,
+    "sloughing": Sloughing,
 }

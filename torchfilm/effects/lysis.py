@@ -18,7 +18,7 @@ from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.random import fine_uniform
 from torchfilm.tools.read_only import read_only
-from torchfilm.tools.row_checks import check_variable
+from torchfilm.tools.row_checks import check_names, check_variable
 from torchfilm.values import CONCENTRATION, Rule, Value, checked, physical
 
 AMOUNT = Rule("conc·µm³", least=0.0, scheduled=True)
@@ -68,6 +68,13 @@ class Lysis(Effect):
     tf.Rules(…, variables={"lysing": 0.0}) has; or "length" or "volume". above, rate: a number, one
     per colony, one per cell type, a distribution drawn at birth, or a Schedule.
 
+    factor: name of a species or variable that multiplies the rate.
+
+    hazard: in place of `rate` and `when`, the name of a species of a circuit that adds up the rate
+    of death, such as {"dying": p.k * s.drug}. At the end of a step a cell bursts by the chance 1 −
+    exp(−dying); in those that live it begins again at 0. So cells die by what they met in the
+    whole step, also where they take up what kills them. A variable of rules serves, too.
+
     releases: what goes to each signal of the Medium, by the signal's name: the name of a species
     (its concentration times the cell's volume is released) or of a variable of rules (its value, an
     amount in conc·µm³), "volume" (one unit of concentration times the volume), a tuple of such
@@ -82,6 +89,8 @@ class Lysis(Effect):
     above: Value | None = physical(None, scheduled=True)
     rate: Value | None = physical(None, unit="1/h", least=0.0, scheduled=True)
     releases: Mapping[str, Any] | None = None
+    factor: str | None = None
+    hazard: str | None = None
 
     stage = LYSIS
     title = "lysis"
@@ -89,10 +98,21 @@ class Lysis(Effect):
     usual_first = 0.0
 
     def __post_init__(self) -> None:
-        if self.when is None and self.rate is None:
+        if self.when is None and self.rate is None and self.hazard is None:
             raise checks.InputError(
-                "Lysis has neither `when` nor `rate`: it needs the name of a species or variable"
-                ' that decides which cells burst, such as when="lysis_protein", or a rate, 1/h.'
+                "Lysis has none of `when`, `rate` and `hazard`: it needs the name of a species or"
+                ' variable that decides which cells burst, such as when="lysis_protein", or a rate,'
+                " 1/h."
+            )
+        check_names("Lysis", factor=self.factor, hazard=self.hazard)
+        for name in ("when", "above", "rate", "factor") if self.hazard is not None else ():
+            if getattr(self, name) is not None:
+                raise checks.input_error(
+                    f"Lysis.{name}", getattr(self, name), "left out with hazard, which is all"
+                )
+        if self.factor is not None and self.rate is None:
+            raise checks.input_error(
+                "Lysis.factor", self.factor, "given with rate, which it multiplies"
             )
         if self.when is None and self.above is not None:
             raise checks.input_error(
@@ -137,7 +157,8 @@ class Lysis(Effect):
         return {s: what for s, what in self.releases.items() if isinstance(what, tuple)}
 
     def at_least_zero(self) -> tuple[str, ...]:
-        return tuple(n for names in self._named.values() for n in names if n != VOLUME)
+        released = (n for names in self._named.values() for n in names if n != VOLUME)
+        return (*released, *(n for n in (self.factor, self.hazard) if n is not None))
 
     def _variables(self) -> tuple[str, ...]:
         """The species and variables that it reads."""
@@ -163,7 +184,8 @@ class Lysis(Effect):
 
     def writes(self) -> tuple[str, ...]:
         assert self.releases is not None
-        return ("cells", *(OUTSIDE + s for s in self.releases))
+        spent = () if self.hazard is None else (self.hazard,)
+        return ("cells", *(OUTSIDE + s for s in self.releases), *spent)
 
     def bind(self, binding: Binding) -> tuple[BoundEffect, ...]:
         return (BoundLysis(self, binding),)
@@ -193,11 +215,18 @@ class BoundLysis(BoundEffect):
     def writes(self) -> tuple[str, ...]:
         return (*super().writes(), *self.binding.reservoirs(self.effect.releases or ()))
 
+    def _fields(self) -> tuple[str, ...]:
+        """Those of the medium that get what is released."""
+        signals = self.effect.releases or ()
+        return (*(OUTSIDE + s for s in signals), *self.binding.reservoirs(signals))
+
     def numerics(self, dt: float, state: State) -> list[str]:
         effect = self.effect
         assert effect.releases is not None
         asked = "" if effect.when is None else f" in which {effect.when} exceeds its bound"
-        chance = "" if effect.rate is None else ", by a draw of 1 − exp(−rate·dt)"
+        rate = "rate·dt" if effect.factor is None else f"rate·{effect.factor}·dt"
+        drawn = rate if effect.rate is not None else effect.hazard
+        chance = "" if drawn is None else f", by a draw of 1 − exp(−{drawn})"
         named = [f"{s} gets {' and '.join(names)}" for s, names in effect._named.items()]
         given = [f"{s} gets an amount" for s in effect.releases if s not in effect._named]
         released = {n for names in effect._named.values() for n in names}
@@ -220,7 +249,10 @@ class BoundLysis(BoundEffect):
             burst = state.groups.sum(bursts.double()).long()
         if gone and effect.releases:
             state, released = self._released(state, bursts)
-        report = LysisReport(burst, released, ((effect.when, unknown),))
+        if effect.hazard is not None:
+            spent = torch.zeros_like(state.fields[effect.hazard])
+            state = state.with_fields(**{effect.hazard: spent})
+        report = LysisReport(burst, released, ((effect.when or effect.hazard, unknown),))
         earlier = state.reports.get(effect.title)
         if self.number and isinstance(earlier, LysisReport):
             report = report.after(earlier)
@@ -237,13 +269,19 @@ class BoundLysis(BoundEffect):
             level = _quantity(state, effect.when)
             unknown = state.groups.any(level.isnan()).long()
             bursts = level > (0.0 if effect.above is None else values.above.of_cells(state))
-        if effect.rate is None:
+        if effect.rate is None and effect.hazard is None:
             return bursts, unknown
+        if effect.hazard is not None:
+            deaths = state.fields[effect.hazard].double()
+            unknown = state.groups.any(deaths.isnan()).long()
+        else:
+            deaths = values.rate.of_cells(state).double() * dt
+            if effect.factor is not None:
+                deaths = deaths * state.fields[effect.factor]
         rows = torch.arange(state.cells, device=state.device)
         purpose = effect.value_owner() + (f" {self.number}" if self.number else "")
         coarse, fine = (state.uniform(rows, f"{purpose} {k}") for k in range(2))
-        chance = -torch.expm1(-values.rate.of_cells(state).double() * dt)
-        return bursts & (fine_uniform(coarse, fine) < chance), unknown
+        return bursts & (fine_uniform(coarse, fine) < -torch.expm1(-deaths)), unknown
 
     def _released(self, state: State, bursts: Tensor) -> tuple[State, dict[str, Tensor]]:
         """The state whose medium has what these cells release, and the sums by colony and
@@ -263,7 +301,7 @@ class BoundLysis(BoundEffect):
                 near, far = (torch.where(there, amount, 0.0) for there in (~away, away))
                 medium.give(signal, near, far)
         settled = medium.settle().fields
-        changed = {n: settled[n] for n in self.writes() if n != "cells"}
+        changed = {n: settled[n] for n in self._fields()}
         return state.with_fields(**changed), total
 
     def _amount(self, state: State, signal: str, what: Any) -> Tensor:

@@ -23,6 +23,7 @@ from torchfilm.tools.row_checks import check_variable
 from torchfilm.values import CONCENTRATION, Value, is_drawn, numbers, physical
 
 CONSTANTS = ("rate", "half", "growth_yield")
+STARVATION = "starvation"
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,11 @@ class Monod(Effect):
     set it. What slows cells down, or stops them, goes into `factor`: the name of a variable of the
     cells, such as rules set or circuits compute, that multiplies the rate of growth and uptake.
 
+    maintenance: 1/h, given as `rate` is: the part of what uptake lets a cell grow by that it needs
+    to live (Pirt, Proc. R. Soc. B 163, 224, 1965). Then dV/dt = (rate · s/(half + s) −
+    maintenance) · V, and 0 where that is below 0: cells do not shrink. What they lack is the field
+    `starvation`, 1/h, by which tf.Lysis(when="starvation", …), rules and circuits may go.
+
     Uptake and transport of the nutrient are solved together: also where a cell would empty the
     voxels about it many times in a step, diffusion feeds it. The medium loses exactly what the
     cells take up, and never more than it contains. A cell grows over the step at the mean
@@ -73,6 +79,7 @@ class Monod(Effect):
     half: Value = physical(1.0, unit=CONCENTRATION, above=0.0)
     growth_yield: Value = physical(1.0, unit="1/conc", above=0.0)
     factor: str | None = None
+    maintenance: Value | None = physical(None, unit="1/h", least=0.0)
 
     stage = NUTRITION
     title = "nutrition"
@@ -83,14 +90,11 @@ class Monod(Effect):
     )
 
     def declares(self, dim: int) -> tuple[Field, ...]:
-        return (
-            Field(
-                f"{self.signal}_eaten",
-                "nutrient taken up since birth",
-                "conc·µm³",
-                at_division="reset",
-            ),
+        eaten = Field(
+            f"{self.signal}_eaten", "nutrient taken up since birth", "conc·µm³", at_division="reset"
         )
+        lacking = Field(STARVATION, "maintenance that uptake does not cover", "1/h")
+        return (eaten,) if self.maintenance is None else (eaten, lacking)
 
     def reads(self) -> tuple[str, ...]:
         return ("position", "length", "radius", OUTSIDE + self.signal)
@@ -111,7 +115,8 @@ class Monod(Effect):
         return () if self.factor is None else (self.factor,)
 
     def writes(self) -> tuple[str, ...]:
-        return ("growth_rate", OUTSIDE + self.signal, f"{self.signal}_eaten")
+        lacking = () if self.maintenance is None else (STARVATION,)
+        return ("growth_rate", OUTSIDE + self.signal, f"{self.signal}_eaten", *lacking)
 
     def only_takes(self) -> tuple[str, ...]:
         return (OUTSIDE + self.signal,)
@@ -206,24 +211,32 @@ class BoundMonod(BoundEffect):
     def _part(self, state: State, dt: float, done: int, number: int) -> State:
         """The state after dt hours of uptake and transport, one of a `number` of parts of a step,
         of which so many are `done`. Cells grow by it after the last."""
-        signal = self.effect.signal
+        effect, signal = self.effect, self.effect.signal
         medium = MediumExchange(state, (signal,))
         medium.find()
         assert state.layout is not None
         # with what it will grow by the parts that are done
         earlier = (state.growth_rate if done else torch.zeros_like(state.growth_rate)).double()
-        eaters = self._eaters(state, medium, torch.exp(earlier * (dt * number)), dt)
+        needed = self._needed(state)
+        # half of what a part's maintenance takes off is off in its middle
+        eaters = self._eaters(
+            state, medium, torch.exp(earlier * (dt * number) - 0.5 * dt * needed), dt
+        )
         taken = uptake.solve(
             eaters, state.layout.grid, self.transport.with_uptake(signal, state),
             state.fields[OUTSIDE + signal], medium.found[signal],
         )  # fmt: skip
         grown = torch.log1p(eaters.gain * taken.amount / eaters.volume) / (dt * number)
+        left = grown - needed / number
         own = f"{signal}_eaten"
         changed = {
             OUTSIDE + signal: taken.end,
-            "growth_rate": earlier + grown,
+            "growth_rate": earlier + (grown if effect.maintenance is None else left.clamp(min=0.0)),
             own: state.fields[own] + taken.amount,
         }
+        if effect.maintenance is not None:
+            lacking = (-left).clamp(min=0.0)
+            changed[STARVATION] = state.fields[STARVATION] + lacking if done else lacking
         total = lambda amount: state.groups.sum(amount)
         for name in self._reservoir():
             changed[name] = state.fields[name] - total(torch.where(eaters.fed, 0.0, taken.amount))
@@ -233,6 +246,12 @@ class BoundMonod(BoundEffect):
         return state.with_fields(**changed).replace(
             reports={**state.reports, "nutrition": note}
         )  # fmt: skip
+
+    def _needed(self, state: State) -> Tensor:
+        """Maintenance of each cell, (N,) float64 1/h."""
+        if self.effect.maintenance is None:
+            return torch.zeros_like(state.length, dtype=torch.float64)
+        return self.values.maintenance.of_cells(state).double().expand(state.cells)
 
     def _eaters(
         self, state: State, medium: MediumExchange, growth: Tensor, dt: float

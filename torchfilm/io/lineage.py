@@ -26,8 +26,8 @@ class Lineage:
     colony: id of its colony · cell: its uid, unique within the colony · parent: uid, −1 for
     founders · born: h; the founders' is the start of the run, and that of cells which a run found
     in the middle of another is not known, NaN · ended: h, NaN while it lives · fate: "alive",
-    "divided", "removed", "left", "lysed" or "failed" · founder: uid of the first of its line in
-    the file.
+    "divided", "removed", "left", "lysed", "eroded", "sloughed" or "failed" · founder: uid of the
+    first of its line in the file.
 
     Cells are named by uid, and in a run of several colonies by `colony`, an id, too. `course` reads
     the file, which must be open. Raises InputError for cells and colonies that the run does not

@@ -69,8 +69,17 @@ def depth_in_walls(
 ) -> Tensor:  # fmt: skip
     """How deep each cell lies in a wall, where it is deepest, (N,) float64 µm; 0 in none. position,
     axis: (N, d). ids: (N,), of the cells' colonies."""
+    surfaces = [s for wall in walls for s in wall.surfaces(position.shape[1])]
+    return depth_in_surfaces(surfaces, position, axis, length, radius, ids)
+
+
+def depth_in_surfaces(
+    surfaces: Sequence[Surface], position: Tensor, axis: Tensor, length: Tensor, radius: Tensor,
+    ids: Tensor,
+) -> Tensor:  # fmt: skip
+    """As `depth_in_walls`, for the surfaces of walls."""
     deep, axis, half = torch.zeros_like(length.double()), axis.double(), 0.5 * length.double()
-    for surface in (s for wall in walls for s in wall.surfaces(position.shape[1])):
+    for surface in surfaces:
         s = surface.deepest(position, axis, half, ids)
         distance, _ = surface.gap_of_points(position + s.unsqueeze(1) * axis, ids)
         deep = torch.maximum(deep, radius.double() - distance)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchfilm.distributions import Uniform
 from torchfilm.effects.division import Division
+from torchfilm.effects.erosion import Erosion
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.medium import Medium
@@ -75,6 +76,8 @@ def biofilm(
     layer: float | None = 10.0,
     spacing: float = 2.0,
     length_drag: float = 1e5,
+    maintenance: float | Tensor | None = None,
+    erosion: float | Tensor | None = None,
 ) -> Scene:
     """A slice of a biofilm on a floor, y = 0, fed from above: periodic along x, so that no edge
     shapes it (after Picioreanu et al. 1998 and Lardon et al. 2011).
@@ -89,6 +92,9 @@ def biofilm(
     Only the product of diffusion, supply and yield matters, while the nutrient that is there at
     first is little: it feeds a film of supply · growth_yield · its own height.
 
+    maintenance: 1/h, what cells need of their growth to live, see `Monod`. erosion: 1/(µm·h), the
+    film loses erosion · h² µm/h where it is h high, see `Erosion`.
+
     width: µm. first: how many cells lie on the floor at the start, in each colony at places of its
     own, 5 µm apart or more. growth_yield: µm³ of cell from one unit of concentration × µm³. The
     slice is 1 µm deep, like the cells.
@@ -99,7 +105,7 @@ def biofilm(
         layer = checks.number("biofilm(layer)", layer, above=0.0)
         top = spacing * math.ceil((1.0 + layer) / spacing)
     return Scene(
-        Monod("nutrient", rate=rate, half=half, growth_yield=growth_yield),
+        Monod("nutrient", rate=rate, half=half, growth_yield=growth_yield, maintenance=maintenance),
         Growth(),
         Division(length=Uniform(3.5, 4.5)),
         Mechanics(
@@ -119,6 +125,7 @@ def biofilm(
             margin=layer,
         ),
         Removal(low=(-math.inf, -math.inf), high=(math.inf, height - BELOW)),
+        *([] if erosion is None else [Erosion(erosion)]),
         founders=partial(_on_the_floor, first, width),
         dt=0.05,
     )

@@ -1,0 +1,222 @@
+"""Erosion and sloughing: the law at which a film loses volume, whatever the step; what nothing
+holds."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers import step
+from ruled import same
+from scipy.stats import poisson
+
+import torchfilm as tf
+from torchfilm.film_shape import Floor, columns_of
+from torchfilm.tools.checks import InputError
+
+FLOOR = [tf.Plane(y=0.0, facing="+y")]
+WIDTH = 20.0
+
+
+def layers(number: int, dim: int = 2, length: float = 2.0) -> tf.Cells:
+    """Cells that lie side by side along x, in so many layers 1 µm high; each takes up 4 µm, so that
+    a column of a layer is half full."""
+    x = torch.arange(2.0, WIDTH, 4.0, dtype=torch.float64)
+    rows = [torch.stack([x, torch.full_like(x, 0.5 + k)], 1) for k in range(number)]
+    position = torch.cat(rows)
+    if dim == 3:
+        position = torch.stack(
+            [position[:, 0], torch.full_like(position[:, 0], 0.5), position[:, 1]], 1
+        )
+    axis = torch.zeros_like(position)
+    axis[:, 0] = 1.0
+    return tf.Cells(position, axis, length)
+
+
+def film(*effects: tf.Effect, dim: int = 2, cells: tf.Cells | None = None, **options) -> tf.Scene:
+    up = tf.Plane(**{"xyz"[dim - 1]: 0.0}, facing="+" + "xyz"[dim - 1])
+    periodic = {"x": (0.0, WIDTH)} | ({"y": (0.0, 6.0)} if dim == 3 else {})
+    mechanics = tf.Mechanics(dim=dim, walls=[up], periodic=periodic)
+    return tf.Scene(mechanics, *effects, founders=cells or layers(5, dim), **options)
+
+
+@pytest.mark.parametrize("order", [0.0, 1.0, 2.0])
+@pytest.mark.parametrize("dt, steps", [(0.2, 1), (0.05, 4)])
+def test_a_film_loses_volume_by_the_law(order, dt, steps):
+    """In each step the mean loss is Σ rate · h^order over the columns, times the volume per height:
+    over 1,000 colonies, to four standard errors. In 0.2 h it is a third of a layer."""
+    rate, spacing = 1.7 / 5.0**order, 0.5
+    model = film(tf.Erosion(rate, order=order, spacing=spacing)).bind(1000)
+    state = model.start(seed=4)
+    differences = torch.zeros(1000, dtype=torch.float64)
+    total = 0.0
+    for _ in range(steps):
+        height = tf.measure.film(state, spacing).height
+        volume = state.groups.sum(state.volume.double())
+        law = dt * rate * (height**order * (height > 0)).sum(1) * volume / height.sum(1)
+        state = model.step(state, dt)
+        differences += state.reports["erosion"].volume - law
+        total += float(law.mean())
+    error = float(differences.std()) / math.sqrt(1000)
+    assert 0 < 4 * error < 0.1 * total and abs(float(differences.mean())) < 4 * error
+
+
+def test_a_long_step_erodes_what_comes_to_light():
+    """Stacks of five cells at the same rate whatever their height: the number that leave in 2 h is
+    Poisson's, though at first only one can be seen."""
+    scene = film(tf.Erosion(1.0, order=0.0))
+    state = scene.bind(400).start(seed=1)
+    height = tf.measure.film(state, 0.5).height[0]
+    after = step(scene, state, 2.0)
+    rate = float((height > 0).sum() / height.sum()) * 5.0  # cells of a stack, per h
+    left = torch.bincount(after.position[:, 1].floor().long(), minlength=5) / 2000
+    wanted = poisson.cdf(4 - np.arange(5), 2.0 * rate)
+    np.testing.assert_allclose(left, wanted, atol=4 * math.sqrt(0.25 / 2000))
+
+
+def test_cells_below_others_stay_until_those_have_left():
+    heap = layers(2)
+    state = film(tf.Erosion(1e-3, order=0.0), cells=heap).bind(200).start(seed=2)
+    after = step(film(tf.Erosion(20.0, order=0.0), cells=heap), state, 0.02)
+    (note,) = after.ended
+    assert note.fate == "eroded" and len(note.uid) > 100
+    assert after.reports["erosion"].cells.sum() == len(note.uid)
+    left = {(c, u) for c, u in zip(note.colony_id.tolist(), note.uid.tolist(), strict=True)}
+    lower = [(c, u) for c, u in left if u < 5]
+    assert lower and all((c, u + 5) in left for c, u in lower)
+
+
+def test_a_film_comes_to_rest_where_growth_balances_erosion():
+    """μ · Σh = rate · Σh² over the columns. Divisions at 4 µm take the caps' volume, so that a
+    colony grows at μ · ln 2/ln((l + 4r/3)/(l/2 + r/3))."""
+    rate, growth = 0.1, 1.0
+    scene = film(
+        tf.Growth(rate=growth), tf.Division(length=4.0), tf.Erosion(rate),
+        cells=layers(3), dt=0.05,
+    )  # fmt: skip
+    ratio = []
+    for state in tf.simulate(scene, until=25.0, colonies=6, seed=3):
+        if state.time > 8.0:
+            height = tf.measure.film(state, 0.5).height
+            ratio.append((height**2).sum() / height.sum())
+    grows = growth * math.log(2) / math.log((4 + 2 / 3) / (2 + 1 / 6))
+    assert float(torch.stack(ratio).mean()) == pytest.approx(grows / rate, rel=0.04)
+
+
+def test_the_same_bits_whatever_the_batch_and_after_a_restart(tmp_path):
+    scene = film(tf.Growth(rate=0.5), tf.Division(), tf.Erosion([0.05, 0.1, 0.2]), tf.Sloughing())
+    whole = list(tf.simulate(scene, until=1.0, seed=5, record=tmp_path / "run.h5"))[-1]
+    alone = scene.bind(3).start(seed=5).select([1])
+    model = scene.bind(3)
+    for _ in range(40):
+        alone = model.step(alone, 0.025)
+    assert same(whole.select([1]), alone)
+    list(tf.simulate(scene, until=0.5, seed=5, record=tmp_path / "half.h5"))
+    with tf.Results(tmp_path / "half.h5") as results:
+        half = results.state(scene)
+    assert 0 < half.step < whole.step
+    *_, later = tf.simulate(scene, half, until=1.0)
+    assert same(whole, later)
+    with tf.Results(tmp_path / "run.h5") as results:
+        assert list(results.lineage().fate).count("eroded") > 5
+
+
+def test_columns_have_the_tops_of_their_cells():
+    """Against points of the surface, by brute force: cells at all angles, in space and plane."""
+    generator = torch.Generator().manual_seed(1)
+    for dim in (2, 3):
+        count = 60
+        size = torch.tensor([*[WIDTH, 6.0][: dim - 1], 6.0], dtype=torch.float64)
+        place = torch.rand(count, dim, generator=generator, dtype=torch.float64) * size
+        axis = torch.randn(count, dim, generator=generator, dtype=torch.float64)
+        axis[0] = 0.0
+        axis[0, -1] = 1.0  # one stands upright
+        axis = axis / axis.norm(dim=1, keepdim=True)
+        periodic = {"x": (0.0, WIDTH)} | ({"y": (0.0, 6.0)} if dim == 3 else {})
+        cells = tf.Cells(place, axis, 1.5, colony=list(range(count)))
+        options = {"dim": dim, "periodic": periodic}
+        state = tf.Scene(tf.Mechanics(**options)).bind(cells=cells, dtype=torch.float64).start()
+        floor = Floor.of("test", state, 0.5, 1.0, None)
+        height = columns_of(state, floor).height().reshape(count, -1)
+        t = torch.linspace(-0.75, 0.75, 1001, dtype=torch.float64)
+        line = place.unsqueeze(1) + t.view(1, -1, 1) * axis.unsqueeze(1)
+        middles = torch.cartesian_prod(*[
+            low + (torch.arange(n) + 0.5) * s
+            for (low, _), n, s in zip(floor.spans, floor.counts, floor.steps, strict=True)
+        ]).reshape(-1, dim - 1).double()  # fmt: skip
+        period = torch.tensor([WIDTH, 6.0][: dim - 1], dtype=torch.float64)
+        wanted = torch.zeros_like(height)
+        for column, middle in enumerate(middles):
+            off = line[..., :-1] - middle
+            off = off - period * torch.round(off / period)
+            rise = 0.25 - (off * off).sum(-1)
+            top = torch.where(rise >= 0, line[..., -1] + rise.clamp(min=0).sqrt() - 1.0, 0.0)
+            wanted[:, column] = top.amax(1)
+        close = (height - wanted.clamp(min=0)).abs()
+        # a column that a cell only grazes may be missed by points
+        assert int((close > 1e-5).sum()) <= 2 and bool((height >= wanted - 1e-9).all())
+        assert (height > 0).double().mean() > 0.01
+
+
+def test_what_nothing_holds_is_carried_away():
+    """A pillar of three cells: without the middle one that above it has nothing to rest on. A
+    neighbour within the gap, across a face too, holds it."""
+    upright = [[0.0, 1.0]] * 3
+    pillar = tf.Cells([[1.0, 1.5], [1.0, 4.5], [1.0, 7.5]], upright, 2.0)
+    scene = film(tf.Sloughing(gap=0.2), cells=pillar)
+    state = scene.bind(2).start()
+    assert step(scene, state, 0.01).cells == 6
+    broken = state.remove(torch.tensor([False, True, False, False, False, False]), "removed")
+    after = step(scene, broken, 0.01)
+    assert after.counts.tolist() == [1, 3] and after.uid.tolist() == [0, 0, 1, 2]
+    note = after.ended[-1]
+    assert note.fate == "sloughed" and note.uid.tolist() == [2] and note.colony_id.tolist() == [0]
+    assert after.reports["sloughing"].cells.tolist() == [1, 0]
+    beside = tf.Cells([[0.6, 1.5], [WIDTH - 0.5, 3.5], [WIDTH - 0.5, 6.4]], upright, 2.0)
+    held = film(tf.Sloughing(gap=0.2), cells=beside)
+    assert step(held, held.bind().start(), 0.01).cells == 3
+
+
+def test_a_wall_on_any_side_holds():
+    ceiling = tf.Plane(y=10.0, facing="-y")
+    cells = tf.Cells([[2.0, 0.5], [6.0, 9.5]], [[1.0, 0.0]] * 2, 2.0)
+    scene = tf.Scene(tf.Mechanics(dim=2, walls=[*FLOOR, ceiling]), tf.Sloughing(), founders=cells)
+    assert step(scene, scene.bind().start(), 0.01).cells == 2
+
+
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        ({"rate": -0.1}, r"Erosion.rate = -0.1 is not allowed.*at least 0"),
+        ({"rate": 0.1, "order": -1.0}, "Erosion.order = -1.0 is not allowed"),
+        ({"rate": 0.1, "spacing": 0.0}, "Erosion.spacing = 0.0 is not allowed"),
+        ({"rate": {0: 0.1, 1: 0.2}}, r"Erosion.rate = .*one number, or one per colony"),
+        ({"rate": 0.1, "across": {"y": (0, 3)}}, "axis = 'y' is not allowed: it must be 'x'"),
+        ({"rate": 0.1, "across": {"x": (0, 3)}}, "left out along x, where space is periodic"),
+    ],
+)
+def test_what_erosion_refuses(given, words):
+    with pytest.raises(InputError, match=words):
+        film(tf.Erosion(**given)).bind(2)
+
+
+def test_where_the_floor_ends_must_be_known():
+    scene = tf.Scene(tf.Mechanics(dim=2, walls=FLOOR), tf.Erosion(0.1), founders=layers(1))
+    with pytest.raises(InputError, match=r"Erosion does not know how far the floor.*across=\{'x'"):
+        scene.bind()
+    within = dataclasses.replace(scene.effects[1], across={"x": (4.0, 12.0)})
+    known = scene.replace(scene.effects[0], within)
+    state = step(known, known.bind().start(), 1e4)
+    # columns from 4 to 12 µm: the cells in the middle of which they end stay on the other side
+    assert state.position[:, 0].tolist() == [2.0, 14.0, 18.0]
+
+
+def test_sloughing_needs_a_wall_and_first_cells_that_it_holds():
+    with pytest.raises(InputError, match="Sloughing removes cells that no wall holds"):
+        tf.Scene(tf.Mechanics(dim=2), tf.Sloughing()).bind()
+    high = tf.Cells([[3.0, 0.5], [3.0, 4.0]], [[1.0, 0.0]] * 2, 2.0)
+    with pytest.raises(InputError, match=r"take cell 1 of colony 0 .*no chain of cells less"):
+        film(tf.Sloughing(), cells=high).bind()

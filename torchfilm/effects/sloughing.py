@@ -1,0 +1,101 @@
+"""Sloughing: parts of a biofilm that nothing holds are carried away."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchfilm.effect import SLOUGHING, Binding, BoundEffect, Effect
+from torchfilm.physics.nearby import gaps_nearby
+from torchfilm.physics.surfaces import Surface
+from torchfilm.physics.walls import depth_in_surfaces
+from torchfilm.reports import CellsLost
+from torchfilm.state import State
+from torchfilm.tools import checks
+from torchfilm.tools.connected import components
+
+
+@dataclass(frozen=True, eq=False)
+class Sloughing(Effect):
+    """Cells that nothing holds are carried away: those from which no chain of cells leads to a wall
+    of Mechanics.
+
+    gap: how far apart the surfaces of two cells, or of a cell and a wall, may be where one holds
+    the other, µm: what slime spans.
+
+    The lineage keeps the end of these cells, with the fate "sloughed"; `state.reports["sloughing"]`
+    has their number and volume.
+    """
+
+    gap: float = 0.5
+
+    stage = SLOUGHING
+    title = "sloughing"
+    by_kernels = True
+    may_repeat = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "gap", checks.number("Sloughing.gap", self.gap, least=0.0))
+
+    def reads(self) -> tuple[str, ...]:
+        return ("position", "axis", "length", "radius")
+
+    def writes(self) -> tuple[str, ...]:
+        return ("cells",)
+
+    def bind(self, binding: Binding) -> tuple[BoundEffect, ...]:
+        return (BoundSloughing(self, binding),)
+
+    def numerics(self, dt: float, state: State) -> list[str]:
+        return [f"at the end of the step: cells within {self.gap:g} µm of each other hang together"]
+
+
+class BoundSloughing(BoundEffect):
+    """Sloughing bound to a batch."""
+
+    effect: Sloughing
+    surfaces: Sequence[Surface] = ()
+
+    def check_others(self, effects: Sequence[BoundEffect]) -> None:
+        self.surfaces = [s for e in effects for s in e.effect.wall_surfaces()]
+        if not self.surfaces:
+            raise checks.InputError(
+                "Sloughing removes cells that no wall holds, and the scene has no wall. Give its"
+                " Mechanics one, such as walls=[tf.Plane(y=0.0, facing='+y')]."
+            )
+
+    def check(self, state: State) -> None:
+        super().check(state)
+        loose = self._loose(state)
+        if bool(loose.any()):
+            k = int(torch.nonzero(loose)[0])
+            raise checks.InputError(
+                f"Sloughing would take cell {int(state.uid[k])} of colony"
+                f" {int(state.own_colony_id[k])} before the first step: from"
+                f" {[round(x, 3) for x in state.position[k].tolist()]} no chain of cells less than"
+                f" {self.effect.gap:g} µm apart leads to a wall. Move the cell, or raise the gap."
+            )
+
+    def step(self, state: State, dt: float) -> State:
+        loose = self._loose(state)
+        report = CellsLost.of(state, loose)
+        state = state.replace(reports={**state.reports, self.title: report})
+        return state.remove(loose, "sloughed")
+
+    @torch.no_grad()
+    def _loose(self, state: State) -> Tensor:
+        """The cells that nothing holds, (N,) bool."""
+        gap, shape = self.effect.gap, (state.position, state.axis, state.length, state.radius)
+        i, j, apart = gaps_nearby(
+            *shape, state.colony, state.colonies, within=gap, space=state.space
+        )
+        near = torch.nonzero(apart < gap).squeeze(1)
+        of = components(i.index_select(0, near), j.index_select(0, near), state.cells)
+        reach = state.radius.double() + gap
+        at_walls = depth_in_surfaces(self.surfaces, *shape[:3], reach, state.own_colony_id) > 0
+        held = torch.zeros(state.cells, dtype=torch.bool, device=state.device)
+        held[of[at_walls]] = True
+        return ~held.index_select(0, of)
