@@ -50,7 +50,7 @@ class Parameter(metaclass=checks.KnownKeywords):
                 f"Parameter({self.name!r})",
                 (self.low, self.high),
                 "low < high",
-                "Swap the two. A fixed value belongs in fixed={…}.",
+                "A fixed value belongs in fixed={…}." if self.low == self.high else "Swap the two.",
             )
         if self.log and self.low <= 0:
             raise checks.input_error(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -78,6 +79,12 @@ def write_design(path: Path, design: FoundDesign, *, colonies: float) -> Path:
             "losses": design.searched.tolist(),
         },
     }
+    text = json.dumps(saved, indent=1, default=_plain)
+    with warnings.catch_warnings():  # the search has given them
+        warnings.simplefilter("ignore")
+        # of the parameters as they will be read
+        scene = task.family.function(**json.loads(text)["parameters"])
+    saved |= {"effects": scene.listing(), "code": scene.code}
     path.write_text(json.dumps(saved, indent=1, default=_plain) + "\n", encoding="utf-8")
     return path
 
@@ -194,8 +201,11 @@ class SavedDesign:
         return {name: every[name] for name in names}
 
     def scene(self) -> tf.Scene:
-        """The scene with these parameters, for one colony or any number of them."""
-        return self.function(**self.content["parameters"])
+        """The scene with these parameters, for one colony or any number of them. Warns where it is
+        not the one that was scored."""
+        made = self.function(**self.content["parameters"])
+        made.warn_if_not(self.path, self.content)
+        return made
 
     @property
     def options(self) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from design.methods import METHODS, Chosen, Method, choose, designs_of, method_o
 from design.objective import Objective
 from design.progress import advance, finish, open_bar
 from design.proposal import Proposal, repeat_study
+from design.remarks import all_failed, remark_on_batch, remark_on_end
 from design.saved_design import why_unsaved
 from design.study import Study
 from design.task import Task, TaskOptions
@@ -30,6 +31,9 @@ from torchfilm import checks, displays
 
 if TYPE_CHECKING:
     from tqdm import tqdm
+
+# A search ends where every colony of this share of its budget failed, of so many at least.
+IN_VAIN, LEAST_IN_VAIN = 0.25, 64
 
 
 @dataclass(eq=False)
@@ -162,14 +166,14 @@ class Search(TaskOptions):
                     run = (self.objective.task, self.study, colonies, executor, work_items)
                     finals = FinalsRun(self.finals, *run)
                 holds = self._search(colonies, stop_at, finals, bar, executor, work_items)
-                if finals is not None and not holds:
+                if finals is not None and not holds and not all_failed(self.study):
                     self._with_all_left(finals, colonies).run()
                 _show(bar, self.study)
                 finish(bar)
         except KeyboardInterrupt:
             self._report_interrupt(colonies)
             raise
-        self._remark(colonies, holds)
+        remark_on_end(self.objective.task, self.study, chosen.method, colonies, holds)
         return self.front() if self.objective.task.goals else self.best()
 
     def _with_all_left(self, finals: FinalsRun, colonies: int) -> FinalsRun:
@@ -184,25 +188,6 @@ class Search(TaskOptions):
         """Whether the method of the run has nothing more to propose."""
         assert self._progress.chosen is not None
         return bool(getattr(self._progress.chosen.method, "over", False))
-
-    def _remark(self, colonies: int, holds: bool) -> None:
-        """Say what makes the outcome of a search worth little. holds: it found what was wanted."""
-        entries = self.study.entries
-        if entries and all(len(e.reasons) == e.losses.size for e in entries):
-            reason = self.study.failures()[0][0]
-            print(f"every colony failed; the most frequent reason: {reason}", file=sys.stderr)
-        assert self._progress.chosen is not None
-        remark = getattr(self._progress.chosen.method, "remark", "")
-        if remark and not holds:
-            print(remark, file=sys.stderr)
-        each = self.objective.task.replicates
-        if sum(len(e.points) for e in entries) == 1 and colonies < 2 * each:
-            print(
-                f"one design was tried, so it is the best: each takes"
-                f" {tf.displays.counted(each, 'colony', 'colonies')}, and the search had"
-                f" {tf.displays.counted(colonies, 'colony', 'colonies')}.",
-                file=sys.stderr,
-            )
 
     def _check_run(self, colonies: int, stop_at: float | None) -> None:
         least = self.objective.task.replicates
@@ -235,7 +220,8 @@ class Search(TaskOptions):
         proposal = repeat_study(method, task, self.study, self._known)
         within_reach = check_within_reach(self.objective, self.study)
         while not self._reached(stop_at, finals):
-            if proposal is None and self._is_over:
+            in_vain = self.study.searched >= max(IN_VAIN * colonies, LEAST_IN_VAIN)
+            if proposal is None and (self._is_over or (in_vain and all_failed(self.study))):
                 return False
             proposal = proposal or Proposal.of_number(
                 len(self.study.entries), method, task, self._known
@@ -255,8 +241,7 @@ class Search(TaskOptions):
             )
             proposal.take(found.entry(streams), self.study)
             within_reach = within_reach or check_within_reach(self.objective, self.study)
-            if len(self.study.entries) == 1 and (remark := task.target.remark(found.loss)):
-                print(remark, file=sys.stderr)
+            remark_on_batch(task, self.study, part.size, found.loss)
             self._progress.why_regrown = found.why_regrown
             if proposal.complete:
                 proposal.tell(method)

@@ -310,3 +310,11 @@ def test_killed_at_any_moment_the_file_opens_and_the_run_resumes(tmp_path, every
     states = record(scene, state, path, every=1, append=True)
     assert_same_state(states[-1], every_step[1][-1])
     assert_same_file(every_step[0], path)
+
+
+def test_a_ready_scene_with_other_effects_has_no_recipe(tmp_path):
+    """What its function was given no longer says what is simulated."""
+    base = tf.scenes.microcolony(rate=1.0)
+    slower = base.replace(tf.Growth(rate=0.5), *base.effects[1:])
+    assert base.recipe[1]["rate"] == 1.0 and slower.recipe is None
+    assert base.replace(dt=0.01).recipe == base.recipe

@@ -34,6 +34,7 @@ def test_a_recorded_parameter_builds_the_same_scene_again(form):
         ("1e-3", 1e-3),
         ("{0: 0.0, 1: 0.001}", {0: 0.0, 1: 0.001}),
         ("PerColony([0, 0.001])", tf.PerColony([0, 0.001])),
+        ("tf.PerColony([0, 0.001])", tf.PerColony([0, 0.001])),
         ("LogNormal(1.0, 0.1)", tf.LogNormal(1.0, 0.1)),
         ("Uniform(low=0.5, high=1.5)", tf.Uniform(low=0.5, high=1.5)),
         ("a word", "a word"),

@@ -24,6 +24,7 @@ from torchfilm.rule_views import OF_EFFECTS
 from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.hashing import digest, without_addresses
+from torchfilm.tools.listings import differences
 from torchfilm.tools.warn_once import once, warn
 from torchfilm.version import __version__
 
@@ -136,7 +137,7 @@ class Scene(metaclass=checks.KnownKeywords):
 
     def replace(self, *effects: Effect, **changes: Any) -> Scene:
         """The same scene with other effects, if any are given, or with another name, dt, founders,
-        …"""
+        … With other effects it is no longer what its recipe makes, and has none."""
         for name in changes:
             if name not in CHANGEABLE:
                 known = ("*effects", *CHANGEABLE)
@@ -146,6 +147,8 @@ class Scene(metaclass=checks.KnownKeywords):
         if any(getattr(e, "dim", self.dim) != self.dim for e in effects):
             # they decide what was not given
             kept |= self._given
+        if effects:
+            kept["recipe"] = None
         with once(self._said):  # what this scene has warned of, its copies need not
             return Scene(*(effects or self.effects), **{**kept, **changes})
 
@@ -204,6 +207,30 @@ class Scene(metaclass=checks.KnownKeywords):
         """Each effect with the parameters that differ from their defaults; results files are
         compared by it."""
         return [without_addresses(summary(effect)) for effect in self.effects]
+
+    def difference(self, effects: list[str] | None, code: list[str] | None) -> str:
+        """In words, what differs from a scene of which a file keeps the `listing()` and the `code`
+        of functions; "" for nothing. Code of another version of Python or torchfilm is not
+        compared."""
+        now = self.listing()
+        if effects is not None and effects != now:
+            return differences(effects, now) or "the same effects in another order"
+        if code is not None and code[:2] == self.code[:2] and code != self.code:
+            return (
+                "a function of its effects was edited, or an object that such a function uses, or a"
+                " parameter with one value per colony"
+            )
+        return ""
+
+    def warn_if_not(self, path: object, design: Mapping[str, Any]) -> None:
+        """Warn where this is another scene than that of a saved design, the content of a file."""
+        kept = (design.get(name) for name in ("effects", "code"))
+        texts = lambda x: isinstance(x, list) and all(isinstance(one, str) for one in x)
+        if found := self.difference(*(x if texts(x) else None for x in kept)):
+            warn(
+                f"{path} is a design of another scene: {found}. Its losses are not those of this"
+                " scene."
+            )
 
     @property
     def space(self) -> PeriodicSpace | None:

@@ -27,9 +27,11 @@ class Racing(AskTell):
     the share of the points that continues from one size to the next. small: replicates at all sizes
     but the last. agree: the race is skipped where the order of the finalists in small and full
     colonies agrees less than this (Kendall's tau, smoothed over races, from 1). Then as many points
-    as `inner` needs are grown to full size at once. -1 never skips. A new cloud of CMAES trusts
-    small colonies again; a model does not. first: finalists of a race from which a cloud or a model
-    is to begin, since the best of them counts most there; before them, `keep` chooses among full
+    as `inner` needs are grown to full size at once. -1 never skips. Where small colonies all have
+    one loss, as where the pattern does not fit into them, the next race is skipped, too. A new
+    cloud of CMAES trusts small colonies again; a model does not. first: finalists of a race from
+    which a cloud or a model is to begin, since the best of them counts most there; before them,
+    `keep` chooses among full
     colonies of `small` replicates. A cloud that needs no more losses has a race like all others.
 
     A race is one bracket of successive halving (Jamieson and Talwalkar, AISTATS 2016), and a
@@ -131,6 +133,8 @@ class Racing(AskTell):
         if self._rung < len(self._rungs) - 1:
             if self._early is None:
                 self._early = loss
+            if np.ptp(loss) == 0:  # they say nothing: no further race of this cloud
+                self._trust = -1.0
             self._rung += 1
             best = np.argsort(loss, kind="stable")[: self._rungs[self._rung][2]]
             self._left = self._left[np.sort(best)]

@@ -27,6 +27,8 @@ from torchfilm import checks
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+
 
 @dataclass(frozen=True)
 class Image(ProfileTarget):
@@ -79,15 +81,17 @@ class Image(ProfileTarget):
         centre: Centre = (0.0, 0.0),
         floor: float = 0.0,
     ) -> Image:
-        """The image in a CSV file: each line is a row of pixels, numbers from 0 to 1. Raises
-        `tf.InputError` if the file cannot be read."""
+        """The image in a CSV file, in which each line is a row of pixels, numbers from 0 to 1; or
+        in a picture, as PNG: its brightness from black, 0, to white, 1, where nothing shows through
+        (needs matplotlib). Raises `tf.InputError` if the file cannot be read."""
         try:
-            pixels = np.loadtxt(path, delimiter=",", ndmin=2)
-        except (OSError, ValueError) as error:
+            picture = Path(path).suffix.lower() in PICTURES
+            pixels = _brightness(path) if picture else np.loadtxt(path, delimiter=",", ndmin=2)
+        except (OSError, ValueError, SyntaxError) as error:
             raise checks.input_error(
                 "Image.load(path)",
                 str(path),
-                "a CSV file with one row of numbers a line",
+                "a CSV file with one row of numbers a line, or a picture: PNG, JPEG, TIFF, BMP",
                 str(error),
             ) from error
         return Image(species, pixels, size, centre=centre, floor=floor)  # type: ignore[arg-type]
@@ -137,3 +141,21 @@ class Image(ProfileTarget):
             f"{self.species} as in an image of {len(self.mask[0])} × {len(self.mask)} pixels,"
             f" {self.size[0]:g} × {self.size[1]:g} µm"
         )
+
+
+def _brightness(path: str | Path) -> np.ndarray:
+    """The brightness of a picture's pixels, (rows, columns), from 0 to 1: the mean of its colours,
+    times how opaque a pixel is."""
+    try:
+        from matplotlib.image import imread
+    except ModuleNotFoundError as error:
+        raise tf.InputError(
+            f"Image.load reads {path} by matplotlib, which is not installed: pip install"
+            ' "torchfilm[app]", or give a CSV file.'
+        ) from error
+    pixels = imread(path)
+    levels = pixels / 255.0 if pixels.dtype.kind == "u" else pixels.astype(np.float64)
+    if levels.ndim == 2:
+        return levels
+    opaque = levels[..., -1] if levels.shape[2] in (2, 4) else 1.0
+    return levels[..., : 3 if levels.shape[2] > 2 else 1].mean(2) * opaque

@@ -219,6 +219,18 @@ def test_races_stop_where_small_colonies_mislead(agree, races):
     assert sizes == [0.25, 1.0] * 6 if races else sizes == [0.25, 1.0] * 3 + [1.0] * 6
 
 
+def test_no_race_follows_one_in_which_all_small_colonies_were_alike():
+    """As where the pattern does not fit into them."""
+    given = begun(Racing(inner=Sobol(batch=6)), SPACES["cube"])
+    sizes = []
+    for _ in range(5):
+        batch = given.ask()
+        sizes.append(batch.size)
+        loss = sphere(batch.points)
+        given.tell(batch, loss if batch.size == 1 else np.ones_like(loss))
+    assert sizes == [0.25, 1.0, 1.0, 1.0, 1.0]
+
+
 def test_a_new_cloud_trusts_small_colonies_again():
     inner = CMAES(population=6, noisy=False)
     given = begun(Racing(inner=inner), SPACES["line"])

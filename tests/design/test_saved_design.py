@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -62,6 +63,26 @@ def test_a_loaded_design_grows_the_colonies_that_were_scored(saved):
     *_, state = tf.simulate(loaded.scene(), **loaded.options)
     assert state.cells >= 6 and state.seed == 3
     assert float(best.objective.task.target.loss(state)[0]) == best.searched[0]
+
+
+def dim(make: float = 1.0, decay: float = 1.0) -> tf.Scene:
+    """As `lit`, with other code."""
+    return lit(0.5 * make, decay)
+
+
+def test_a_design_of_another_scene_is_told(saved, tmp_path):
+    _, path = saved
+    with pytest.warns(UserWarning, match=r"best.json is a design of another scene: .*Its losses"):
+        load_design(path, scene=dim).scene()
+    content = json.loads(path.read_text())
+    content["code"][0] = "2.7"
+    del content["effects"]
+    older = tmp_path / "older.json"
+    older.write_text(json.dumps(content))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_design(path, scene=lit).scene()
+        load_design(older, scene=dim).scene()  # code of another Python says nothing
 
 
 def test_a_loaded_design_is_checked_as_the_winner_itself(saved):

@@ -1,9 +1,12 @@
-"""A search says once what all its designs make one say."""
+"""What a search says of itself: once what all its designs make one say, and where it is in vain."""
 
 import warnings
 
+import pytest
+import torch
+
 import torchfilm as tf
-from design import Measured, Parameter, Search, Sobol
+from design import Measured, Parameter, Racing, Search, Sobol
 
 
 def makes(u, s, p, cell):
@@ -32,3 +35,42 @@ def test_small_species_are_told_once_and_not_for_each_design():
         search.run(colonies=12, progress=False)
     small = [w for w in told if "its species are of about" in str(w.message)]
     assert len(small) == 2  # as the search is made, and as it runs
+
+
+def leaves(rate=1.0) -> tf.Scene:
+    """Cells that grow out of their box: no colony comes to its end."""
+    return tf.Scene(
+        tf.Growth(rate=rate), tf.Division(length=4.0),
+        tf.Medium(a=tf.Signal(diffusion=1.0), box=((-3.0, -3.0), (3.0, 3.0)), spacing=3.0),
+        tf.Mechanics(dim=2), dt=0.1,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("colonies", "grown"), [(300, 80), (40, 40)])
+def test_a_search_ends_where_every_colony_fails(colonies, grown, capfd):
+    """After a quarter of the budget, of 64 colonies at least; no colony goes to the finals."""
+    search = Search(
+        leaves, [Parameter("rate", 1.0, 2.0)],
+        Measured({"cells": lambda state: state.counts.double()}, {"cells": 9.0}, {"cells": 1.0}),
+        until=4.0, replicates=2, method=Sobol(batch=5), seed=0,
+    )  # fmt: skip
+    search.run(colonies, progress=False)
+    assert 0 < search.study.colonies <= grown and not search.study.finals
+    assert "every colony failed; the most frequent reason: " in capfd.readouterr().err
+
+
+def test_a_search_says_that_small_colonies_tell_nothing_apart(capfd):
+    def count(k=1.0) -> tf.Scene:
+        return tf.Scene(
+            tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2),
+            tf.Circuit(makes, species="m", k=k), dt=0.1,
+        )  # fmt: skip
+
+    large = lambda state: torch.where(state.counts < 16, 0.0, most(state))
+    search = Search(
+        count, [Parameter("k", 0.1, 2.0)], Measured({"m": large}, {"m": 1.0}, {"m": 1.0}),
+        cells=20, replicates=1, method=Racing(inner=Sobol(batch=4)), seed=0, finals=None,
+    )  # fmt: skip
+    search.run(colonies=10, progress=False)
+    said = capfd.readouterr().err
+    assert said.count("colonies of 0.25 of the size all have the loss 1:") == 1

@@ -277,6 +277,27 @@ def test_image_from_a_file(tmp_path):
             Image.load(tmp_path / name, "yfp", (12.0, 8.0))
 
 
+@pytest.mark.parametrize("kind", ["grey", "colour", "opaque", "jpg"])
+def test_image_from_a_picture(kind, tmp_path):
+    """Black is 0 and white 1; what shows through counts as black."""
+    image = pytest.importorskip("PIL.Image")
+    levels = np.array([[0, 51, 255], [102, 255, 0]], np.uint8)
+    if kind == "grey":
+        made = image.fromarray(levels)
+    elif kind == "opaque":
+        white = np.full((2, 3, 3), 255, np.uint8)
+        made = image.fromarray(np.dstack([white, levels]))
+    else:
+        made = image.fromarray(np.dstack([levels] * 3))
+    path = tmp_path / ("x.jpg" if kind == "jpg" else "x.png")
+    made.save(path, **({"quality": 100, "subsampling": 0} if kind == "jpg" else {}))
+    found = Image.load(path, "yfp", (12.0, 8.0))
+    np.testing.assert_allclose(found.mask, levels / 255, atol=0.02 if kind == "jpg" else 1e-6)
+    path.write_text("no picture")
+    with pytest.raises(tf.InputError, match="or a picture: PNG"):
+        Image.load(path, "yfp", (12.0, 8.0))
+
+
 def test_measures_say_how_bright_it_is_inside_and_outside():
     found = LEFT.measures(row([-4, -2, 2, 4], yfp=[3, 1, 0.5, 0.5]))
     assert {name: float(v) for name, v in found.items()} == {

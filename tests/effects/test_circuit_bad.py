@@ -40,7 +40,12 @@ def bad(rates, species=("m",), **options):
 AT_ONCE = {
     "no species": (bad(idle, ()), r"Circuit\.species.*at least one"),
     "a species twice": (bad(idle, ("m", "m")), r"Circuit\.species.*different names"),
-    "a species that is no name": (bad(idle, ("m w",)), r"Circuit\.species"),
+    "a species that is no name": (bad(idle, ("m w",)), r"Circuit\.species.*'m w' is none: it may"),
+    "first levels as species": (
+        bad(idle, {"m": 5.0}),
+        r"Write species=\('m',\)\. First levels go into initial=\{'m': 5",
+    ),
+    "species without an order": (bad(idle, {"m"}), r"a tuple of different.*species=\('m',\)\."),
     "species in one string": (
         bad(idle, "a, b"),
         r"Circuit\.species = 'a, b'.*Pass a tuple of names: species=\('a', 'b'\)\.",

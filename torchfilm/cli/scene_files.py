@@ -98,6 +98,8 @@ def _scene_of_design(what: str, parameters: dict[str, Any]) -> Scene:
     made = load_scene(
         home, {**plan["parameters"], **parameters}, str(plan.get("function") or "scene")
     )
+    if not parameters:
+        made.warn_if_not(what, plan)
     return made.replace(dt=checks.number(f"dt in {what}", plan.get("dt", made.dt), above=0.0))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from numbers import Integral
 from typing import Any
 
@@ -44,17 +44,27 @@ def left_out(circuit: Any) -> str:
 
 def names_of(species: Sequence[str], what: str = "species") -> tuple[str, ...]:
     """Names of species, checked."""
+    rule, given = "a tuple of different names, at least one", f"Circuit.{what}"
+    if isinstance(species, Mapping | Set):
+        hint = f"Write {what}={tuple(species)}."
+        if isinstance(species, Mapping):
+            hint += f" First levels go into initial={dict(species)}."
+        raise checks.input_error(given, species, rule, hint)
     names = (species,) if isinstance(species, str) else tuple(species)
-    if not _fit(names):
+    wrong = [n for n in names if not _is_name(n)]
+    if wrong:
         apart = tuple(species.replace(",", " ").split()) if isinstance(species, str) else ()
-        hint = f"Pass a tuple of names: {what}={apart}." if _fit(apart) else ""
-        raise checks.input_error(f"Circuit.{what}", species, "different names, at least one", hint)
+        hint = f"{wrong[0]!r} is none: it may have letters, digits and _ only, as in u.NAME."
+        if apart and all(map(_is_name, apart)):
+            hint = f"Pass a tuple of names: {what}={apart}."
+        raise checks.input_error(given, species, rule, hint)
+    if not names or len(set(names)) < len(names):
+        raise checks.input_error(given, species, rule)
     return names
 
 
-def _fit(names: Sequence[Any]) -> bool:
-    distinct = bool(names) and len(set(names)) == len(names)
-    return distinct and all(isinstance(n, str) and n.isidentifier() for n in names)
+def _is_name(given: Any) -> bool:
+    return isinstance(given, str) and given.isidentifier()
 
 
 def check_species(names: tuple[str, ...], shared: Mapping[str, str]) -> None:

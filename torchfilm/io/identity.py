@@ -3,9 +3,7 @@ given scene is the same one."""
 
 from __future__ import annotations
 
-import difflib
 import json
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,6 +14,7 @@ from torchfilm.physics.surfaces import as_data
 from torchfilm.scene import Scene
 from torchfilm.state import State
 from torchfilm.tools.checks import InputError
+from torchfilm.tools.listings import list_kinds
 from torchfilm.tools.warn_once import quietly
 
 
@@ -60,7 +59,7 @@ def check_fields(file: h5py.File, path: object, template: State) -> None:
     if any(kinds.values()):
         kinds["not in this scene:"] = [n for n in there if n not in here]
         raise InputError(
-            f"{path} was recorded with other fields than this scene has ({_list_kinds(kinds)})."
+            f"{path} was recorded with other fields than this scene has ({list_kinds(kinds)})."
             " Undo the edit to resume the run, or start a new run."
         )
     if "signals" in file and template.layout is None:
@@ -73,52 +72,11 @@ def check_fields(file: h5py.File, path: object, template: State) -> None:
 def check_same_scene(attributes: Mapping[str, Any], path: object, scene: Scene) -> None:
     """Raise InputError unless `scene` has the effects, the parameters and the code of functions
     that the file's attributes list."""
-    was, now = json.loads(attributes.get("effects", "null")), scene.listing()
-    code, mine = json.loads(attributes.get("code", "null")), scene.code
-    differs = ""
-    if was is not None and was != now:
-        differs = _differences(was, now) or "the same effects in another order"
-    elif code is not None and code[:2] == mine[:2] and code != mine:
-        differs = (
-            "a function of its effects was edited, or an object that such a function uses, or a"
-            " parameter with one value per colony"
-        )
+    was, code = (json.loads(attributes.get(name, "null")) for name in ("effects", "code"))
+    differs = scene.difference(was, code)
     if differs:
         raise InputError(
             f"{path} is of another scene: {differs}. If you intend this change, give resume"
             " --changed; in Python results.state(scene, changed=True) and Recorder(…,"
             " changed=True)."
         )
-
-
-def _differences(was: list[str], now: list[str]) -> str:
-    """What differs between two listings of effects. Of an effect that both have in different forms
-    only the parts that differ: a circuit has a long text."""
-    gone, new = [e for e in was if e not in now], [e for e in now if e not in was]
-    changed = []
-    for old in tuple(gone):
-        kind = old.partition("(")[0]
-        other = next((e for e in new if e.partition("(")[0] == kind), None)
-        if other is not None:
-            gone.remove(old)
-            new.remove(other)
-            changed += [f"{kind}: {a} there, {b} in this scene" for a, b in _changed(old, other)]
-    whole = _list_kinds({"recorded with": gone, "this scene has": new})
-    return "; ".join([*changed, *([whole] if whole else [])])
-
-
-def _changed(old: str, new: str) -> list[tuple[str, str]]:
-    """The arguments in which two texts of one effect differ, "nothing" where one lacks them."""
-    was, now = (re.split(r"(, |[()\[\]{}])", text) for text in (old, new))
-    shown = lambda parts: repr(text) if (text := "".join(parts).strip(", ")) else "nothing"
-    return [
-        (shown(was[i:j]), shown(now[k:m]))
-        for kind, i, j, k, m in difflib.SequenceMatcher(None, was, now, False).get_opcodes()
-        if kind != "equal"
-    ]
-
-
-def _list_kinds(kinds: dict[str, list[str]]) -> str:
-    return "; ".join(
-        f"{kind} {', '.join(map(repr, names))}" for kind, names in kinds.items() if names
-    )

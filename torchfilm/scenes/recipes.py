@@ -51,9 +51,9 @@ def _given_value(value: Any) -> Any:
 
 
 def parse_value(text: str) -> Any:
-    """A parameter as typed on the command line: a Python literal, also true and false in
-    any case, `PerColony([…])`, or a distribution such as `LogNormal(1.0, 0.2)`; anything else is
-    text."""
+    """A parameter as typed on the command line: a Python literal, also true and false in any case,
+    `PerColony([…])`, or a distribution such as `LogNormal(1.0, 0.2)`, with `tf.` before it or not;
+    anything else is text."""
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
     try:
@@ -68,12 +68,13 @@ def parse_value(text: str) -> Any:
 
 def _call(node: ast.expr) -> Any:
     """The value of a literal, of a call of a known name, or of a dict of either."""
-    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+    if isinstance(node, ast.Call):
         known: dict[str, Any] = {**DISTRIBUTIONS, "PerColony": PerColony}
-        if node.func.id not in known:
-            raise checks.InputError(f"{node.func.id} is not one of {', '.join(known)}.")
+        name = ast.unparse(node.func).removeprefix("tf.")
+        if name not in known:
+            raise checks.InputError(f"{name} is not one of {', '.join(known)}.")
         given = {k.arg: _call(k.value) for k in node.keywords if k.arg is not None}
-        return known[node.func.id](*(_call(a) for a in node.args), **given)
+        return known[name](*(_call(a) for a in node.args), **given)
     if isinstance(node, ast.Dict) and all(k is not None for k in node.keys):
         pairs = zip(node.keys, node.values, strict=True)
         return {ast.literal_eval(k): _call(v) for k, v in pairs if k is not None}

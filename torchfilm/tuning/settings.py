@@ -70,6 +70,7 @@ class Settings(metaclass=checks.KnownKeywords):
             *(effect.with_settings(self) for effect in scene.effects),
             dt=scene.dt if self.dt is None else self.dt,
             accuracy={**scene.accuracy, **self.given},
+            recipe=scene.recipe,  # which makes it, with these settings
         )
 
     def save(self, path: str | Path) -> Path:

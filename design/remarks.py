@@ -1,0 +1,51 @@
+"""What a search says of itself as it runs, on stderr: what makes its outcome worth little."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+
+from design.methods import Method
+from design.study import Study
+from design.task import Task
+from torchfilm import displays
+
+
+def all_failed(study: Study) -> bool:
+    """Whether no colony has come to its end."""
+    return bool(study.entries) and all(len(e.reasons) == e.losses.size for e in study.entries)
+
+
+def remark_on_batch(task: Task, study: Study, size: float, loss: np.ndarray) -> None:
+    """Say what the first batch of a search shows; and that small colonies tell nothing apart.
+
+    size: of the batch's colonies. loss: (n,)."""
+    if len(study.entries) == 1 and (remark := task.target.remark(loss)):
+        print(remark, file=sys.stderr)
+    if size < 1 and loss.ndim == 1 and len(loss) > 1 and np.ptp(loss) == 0:
+        print(
+            f"colonies of {size:g} of the size all have the loss {float(loss[0]):g}: chance decides"
+            " which designs go on. The pattern may not fit into so few cells.",
+            file=sys.stderr,
+        )
+
+
+def remark_on_end(task: Task, study: Study, method: Method, colonies: int, holds: bool) -> None:
+    """Say what makes the outcome worth little. colonies: the budget. holds: whether the search
+    found what was wanted."""
+    if all_failed(study):
+        reason = study.failures()[0][0]
+        print(f"every colony failed; the most frequent reason: {reason}", file=sys.stderr)
+    remark = getattr(method, "remark", "")
+    if remark and not holds:
+        print(remark, file=sys.stderr)
+    each = task.replicates
+    if sum(len(e.points) for e in study.entries) == 1 and colonies < 2 * each:
+        counted = displays.counted
+        print(
+            "one design was tried, so it is the best: each takes"
+            f" {counted(each, 'colony', 'colonies')}, and the search had"
+            f" {counted(colonies, 'colony', 'colonies')}.",
+            file=sys.stderr,
+        )
