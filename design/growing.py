@@ -40,12 +40,14 @@ def grow(
     cells: int | None,
     until: float | None,
     note: Callable[[tf.State], Tensor | None],
+    empty: bool = False,
 ) -> Iterator[FinishedColonies | FailedColony]:
     """Step a batch until each colony reaches its end: `cells` cells or `until` h, whichever comes
     first.
 
     The end of a colony depends on that colony alone, so its result does not depend on its batch.
-    note: called after every step; see `Target.note` and `Target.course`.
+    note: called after every step; see `Target.note` and `Target.course`. empty: whether a colony
+    without cells goes on to its end; else it has failed.
     """
     state = prepared.first
     count = state.colonies
@@ -55,7 +57,7 @@ def grow(
     running = tf.advance(prepared.step, state)
     state = next(running)
     while True:
-        failed, gone = _failed(state)
+        failed, gone = _failed(state, empty)
         yield from failed
         if bool(gone.all()):
             return
@@ -77,8 +79,9 @@ def grow(
         state = running.send(_keep(state, ~gone))
 
 
-def _failed(state: tf.State) -> tuple[list[FailedColony], Tensor]:
-    """The colonies that failed in the last step or have no cells, and a mask of them, (B,)."""
+def _failed(state: tf.State, may_be_empty: bool) -> tuple[list[FailedColony], Tensor]:
+    """The colonies that failed in the last step, or have no cells where they must have some, and a
+    mask of them, (B,)."""
     failures = colonies.failures(state)
     out = [
         FailedColony(colony_id, f"at {state.time:g} h: {reason}")
@@ -86,6 +89,8 @@ def _failed(state: tf.State) -> tuple[list[FailedColony], Tensor]:
     ]
     gone = torch.zeros(state.colonies, dtype=torch.bool, device=state.device)
     gone[list(failures)] = True
+    if may_be_empty:
+        return out, gone
     empty = (state.counts == 0) & ~gone
     out += [
         FailedColony(colony_id, f"no cells remain at {state.time:g} h")

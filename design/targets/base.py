@@ -35,7 +35,8 @@ class Target(metaclass=checks.KnownKeywords):
     """
 
     failed: ClassVar[float] = WORST
-    fewest: ClassVar[int] = 1  # cells: a smaller colony is not scored
+    # cells: a smaller colony is not scored; 0: one in which all cells have died is
+    fewest: ClassVar[int] = 1
     # whether answers without a pattern, such as evenly lit cells, say what a loss is worth
     pattern: ClassVar[bool] = True
     # whether it asks how many cells are lit, and not which

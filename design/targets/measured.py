@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import torch
 from torch import Tensor
@@ -29,7 +29,8 @@ class Measured(Target):
 
     Loss: the mean over the measures of ((measure − wanted)/spread)², 0 within a range. It has no
     upper limit but 100², a measure 100 spreads off. A colony in which a measure is not a number has
-    failed. For several processes, functions stand at the top level of a file.
+    failed, and so has one in which no cell is left; with extinct=True that one is measured, too, as
+    where a drug is to kill all. For several processes, functions stand at the top level of a file.
     """
 
     failed = WORST
@@ -37,8 +38,15 @@ class Measured(Target):
     functions: Mapping[str, Measure]
     wanted: Mapping[str, float | tuple[float, float]]
     spread: Mapping[str, float]
+    _: KW_ONLY
+    extinct: bool = False
+
+    @property
+    def fewest(self) -> int:  # type: ignore[override]
+        return 0 if self.extinct else 1
 
     def __post_init__(self) -> None:
+        checks.choice("Measured.extinct", self.extinct, (True, False))
         if not isinstance(self.functions, Mapping) or not self.functions:
             rule = "a dict of functions by name, such as {'order': tf.measure.nematic_order}"
             raise checks.input_error("Measured.functions", self.functions, rule)
@@ -100,7 +108,8 @@ class Measured(Target):
         apart = self.residuals(state)
         # one after the other: the bits of a sum along rows may depend on their number
         loss = sum((a * a for a in apart.unbind(1)), apart.new_zeros(len(apart)))
-        return torch.where((state.counts > 0) & ~loss.isnan(), loss, self.failed)
+        scored = (state.counts >= self.fewest) & ~loss.isnan()
+        return torch.where(scored, loss, self.failed)
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:

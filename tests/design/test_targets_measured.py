@@ -1,12 +1,15 @@
 """The target for measures of one's own."""
 
 import math
+from functools import partial
 
+import numpy as np
 import pytest
 import torch
 
 import torchfilm as tf
 from design import Local, Measured, Parameter, Search, Sobol, Task, Weighted
+from design.objective import Objective
 from design.saved_design import load_design
 
 
@@ -121,3 +124,35 @@ def test_a_saved_design_asks_for_it_again(tmp_path):
 def test_bad_input(made, words):
     with pytest.raises(tf.InputError, match=words):
         made()
+
+
+def dying(k=1.0) -> tf.Scene:
+    def update(cells):
+        cells.remove_flag = cells.chance(1 - torch.exp(-cells.p.k * cells.dt))
+
+    return tf.Scene(
+        tf.Rules(update, parameters={"k": k}), founders=partial(draw, 20), dim=2, dt=0.1
+    )
+
+
+def draw(count, seed):
+    return tf.inoculum(count, 20.0, seed=seed)
+
+
+@pytest.mark.parametrize("extinct", [False, True])
+def test_colonies_in_which_all_have_died(extinct):
+    """They have failed, or are measured as they are, whatever the others of the batch do."""
+    target = Measured(
+        {"left": lambda state: state.counts.double()}, {"left": 0.0}, {"left": 5.0}, extinct=extinct
+    )
+    objective = Objective(
+        Task(dying, [Parameter("k", 0.1, 20.0)], target, until=1.0, replicates=3, seed=2)
+    )
+    found = objective.evaluate(np.array([[1.0], [0.0]]))
+    fast = [[0.0] * 3] if extinct else [[target.failed] * 3]
+    assert found.losses[:1].tolist() == fast and (found.losses[1] < 100).all()
+    assert len(found.reasons) == (0 if extinct else 3)
+    alone = objective.evaluate(np.array([[1.0]]))
+    assert np.array_equal(alone.losses, found.losses[:1])
+    ends = [part.state.counts.sum() for part in objective.colonies(np.array([1.0]))]
+    assert sum(map(int, ends)) == 0 and bool(ends) == extinct
