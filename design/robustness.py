@@ -15,6 +15,7 @@ import torchfilm as tf
 from design.parameters import Value, show_value
 from design.robustness_plots import draw_changes, draw_indices, draw_losses
 from design.sensitivity import Indices
+from design.variation import Varied
 from torchfilm import checks
 
 
@@ -60,7 +61,8 @@ class Robustness:
     values: its parameters; streams (S,): the fresh streams of random numbers; losses (S,): the loss
     of each; failed: share of the colonies that failed; searched (R,): the losses in the search;
     threshold: a loss that is good enough, or None; sizes, changes: the design in other sizes and
-    with other parameters; indices: which parameters matter, or None.
+    with other parameters; indices: which parameters matter, or None; varied: variants in which all
+    parameters differ at once, or None.
     """
 
     values: dict[str, Value]
@@ -72,6 +74,7 @@ class Robustness:
     sizes: tuple[Resized, ...]
     changes: tuple[ParameterChange, ...]
     indices: Indices | None
+    varied: Varied | None = None
 
     @property
     def mean(self) -> float:
@@ -115,7 +118,15 @@ class Robustness:
             (f"× {s.share:g}", _or_blank(s.cells), _or_blank(s.until), *_summary(s.losses))
             for s in self.sizes
         ]
-        lines += [*_aligned(rows), "", *_aligned(self._change_rows())]
+        if self.varied is not None:
+            name = f"all parameters ± {self.varied.vary:.0%}"
+            rows.append((name, "", "", *_summary(self.varied.losses)))
+        lines += _aligned(rows)
+        if self.varied is not None and self.varied.clipped > 0:
+            lines.append(
+                f"of varied parameters {self.varied.clipped:.0%} were held by their bounds"
+            )
+        lines += ["", *_aligned(self._change_rows())]
         if self.indices is not None:
             lines += [
                 "",
@@ -167,6 +178,8 @@ class Robustness:
         axes = figure.subplots(1, panels)
         sizes = [(f"× {s.share:g}", s.losses) for s in self.sizes]
         columns = [("searched", self.searched), ("fresh", self.losses), *sizes]
+        if self.varied is not None:
+            columns.append((f"all ± {self.varied.vary:.0%}", self.varied.losses))
         draw_losses(axes[0], columns, self.threshold)
         draw_changes(
             axes[1],
@@ -208,7 +221,7 @@ def _plain(given: Any) -> Any:
         return [_plain(x) for x in given]
     if isinstance(given, float):
         return given if math.isfinite(given) else None
-    if isinstance(given, (Resized, ParameterChange, Indices, Robustness, dict)):
+    if isinstance(given, (Resized, ParameterChange, Indices, Varied, Robustness, dict)):
         return {
             name: _plain(value)
             for name, value in (given if isinstance(given, dict) else vars(given)).items()

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from design.parameters import Choice, Parameter, Space, Value
 from design.progress import advance, open_bar
 from design.robustness import ParameterChange, Resized, Robustness
 from design.sensitivity import loss_indices
+from design.variation import varied
 from torchfilm import checks
 
 
@@ -41,6 +42,7 @@ def check_robustness(
     seeds: int = 32,
     sizes: Sequence[float] = (0.5, 2.0),
     change: float = 0.2,
+    vary: float = 0.0,
     samples: int = 0,
     threshold: float | None = None,
     executor: Executor | None = None,
@@ -53,17 +55,19 @@ def check_robustness(
     + seeds − 1). Every part of the check uses the same streams, so that differences are due to what
     is changed. sizes: further colony sizes, as shares of the one searched, above 1 too. change:
     each parameter alone at value·(1 ± change), or at the bound that this exceeds; a whole number at
-    its neighbours, a choice at each other option. samples: a power of two, for Sobol' indices over
-    the whole space (Saltelli et al. 2010; scipy.stats.sobol_indices) of the mean loss on the
-    searched streams, where a failed colony counts with its loss. They cost samples·(D + 2)·R
-    colonies; 0 leaves them out. threshold: a loss that is good enough; the result gives the share
-    of seeds that reach it. executor, work_items: as in `Objective.evaluate`. Raises InputError for
-    an argument that is not allowed.
+    its neighbours, a choice at each other option. vary: all parameters at once, as where parts are
+    uncertain: as many variants as seeds, each number times its own exp(vary · normal number),
+    within its bounds, on four of the streams in turn; 0 leaves them out. samples: a power of two,
+    for Sobol' indices over the whole space (Saltelli et al. 2010; scipy.stats.sobol_indices) of the
+    mean loss on the searched streams, where a failed colony counts with its loss. They cost
+    samples·(D + 2)·R colonies; 0 leaves them out. threshold: a loss that is good enough; the result
+    gives the share of seeds that reach it. executor, work_items: as in `Objective.evaluate`. Raises
+    InputError for an argument that is not allowed.
     """
     if not isinstance(getattr(best, "objective", None), Objective):
         raise checks.input_error("best", best, "the design that a search returned, a Best")
     checks.integer("work_items", work_items, least=1)
-    _check_arguments(seeds, sizes, change, samples, threshold)
+    _check_arguments(seeds, sizes, change, vary, samples, threshold)
     objective, task = best.objective, best.objective.task
     searched, dimensions = task.replicates, task.space.size
     streams = tuple(range(searched, searched + seeds))
@@ -71,12 +75,11 @@ def check_robustness(
     moved = (points != best.point).any(1)
     moved[0] = True
     cost = samples * (dimensions + 2) * searched
+    run: dict[str, Any] = {"executor": executor, "work_items": work_items}
     note = f"{cost} for {samples} samples of {dimensions} parameters" if samples else ""
-    total = seeds * (int(moved.sum()) + sum(sizes)) + cost
+    total = seeds * (int(moved.sum()) + sum(sizes) + (vary > 0)) + cost
     with open_bar(total, progress, "check", note) as bar:
-        found = objective.evaluate(
-            points[moved], streams=streams, executor=executor, work_items=work_items
-        )
+        found = objective.evaluate(points[moved], streams=streams, **run)
         advance(bar, found.losses.size)
         losses = np.full((len(points), seeds), np.nan)
         losses[moved] = found.losses
@@ -85,11 +88,9 @@ def check_robustness(
             other = Objective(task.resized(share))
             resized.append(_resized(other, share, best.point, streams, executor, work_items))
             advance(bar, seeds * share)
-        indices = (
-            loss_indices(objective, samples, executor=executor, work_items=work_items, bar=bar)
-            if samples
-            else None
-        )
+        at_once = varied(objective, best.point, float(vary), streams, **run) if vary else None
+        advance(bar, seeds if vary else 0)
+        indices = loss_indices(objective, samples, bar=bar, **run) if samples else None
     return Robustness(
         values=dict(best.values),
         streams=streams,
@@ -103,6 +104,7 @@ def check_robustness(
             for (k, wanted, _), p, row in zip(changes, points[1:], losses[1:], strict=True)
         ),
         indices=indices,
+        varied=at_once,
     )
 
 
@@ -135,7 +137,12 @@ def _resized(
 
 
 def _check_arguments(
-    seeds: int, sizes: Sequence[float], change: float, samples: int, threshold: float | None
+    seeds: int,
+    sizes: Sequence[float],
+    change: float,
+    vary: float,
+    samples: int,
+    threshold: float | None,
 ) -> None:
     checks.integer("seeds", seeds, least=1)
     if isinstance(sizes, str) or not isinstance(sizes, Sequence):
@@ -154,6 +161,7 @@ def _check_arguments(
     checks.number("change", change, above=0.0, hint="0.2 changes each parameter by 20 %.")
     if change >= 1:
         raise checks.input_error("change", change, "below 1", "0.2 changes each parameter by 20 %.")
+    checks.number("vary", vary, least=0.0, most=3.0, hint="0.2 varies parameters by some 20 %.")
     if checks.integer("samples", samples, least=0) and (samples & (samples - 1) or samples == 1):
         below = max(2, 1 << (samples.bit_length() - 1))
         raise checks.input_error(

@@ -15,6 +15,7 @@ from searching import Level, built, fragile, lit, mean, objective_of
 
 import torchfilm as tf
 from design import Best, Choice, Parameter, Search, Target, check_robustness
+from design.variation import _variants
 
 MAKE = Parameter("make", 0.1, 10, log=True)
 
@@ -357,3 +358,33 @@ def test_results_are_saved_under_a_name_that_tells_their_format(held, tmp_path):
         held.save(tmp_path / "held.csv")
     with pytest.raises(tf.InputError, match=r"path = 3.*the path of a file"):
         held.save(3)
+
+
+def test_all_parameters_vary_at_once_within_their_bounds(spare, tmp_path):
+    """The factors are log-normal, one for each value, and the loss that of the variant itself."""
+    found = check_robustness(spare, seeds=40, sizes=(), vary=0.3, progress=False)
+    varied, space = found.varied, spare.objective.task.space
+    values = [space.values(point) for point in varied.points]
+    for name in space.names:
+        logs = np.log([v[name] / spare.values[name] for v in values])
+        free = np.abs(logs) > 1e-9
+        assert free.mean() > 0.5 and 0.15 < logs[free].std() < 0.45
+    one, other = (np.log([v[n] for v in values]) for n in space.names[:2])
+    assert abs(np.corrcoef(one, other)[0, 1]) < 0.5
+    each = spare.objective.evaluate(varied.points[:1], streams=found.streams[:1]).losses
+    assert varied.losses.shape == (40,) and varied.losses[0] == each[0, 0]
+    again = check_robustness(spare, seeds=40, sizes=(), vary=0.3, progress=False)
+    assert np.array_equal(again.varied.losses, varied.losses)
+    assert "all parameters ± 30%" in found.table()
+    saved = json.loads(found.save(tmp_path / "held.json").read_text())
+    assert saved["varied"]["losses"] == varied.losses.tolist()
+    found.plot(tmp_path / "held.png")
+    assert check_robustness(spare, seeds=2, sizes=(), progress=False).varied is None
+
+
+def test_choices_and_whole_numbers_do_not_vary():
+    point = np.array([0.5, 0.5, 0.25])
+    parameters = [Choice("kind", ["a", "b"]), Parameter("n", 1, 4, whole=True), MAKE]
+    points, clipped = _variants(parameters, point, 10.0, 50)
+    assert (points[:, :2] == point[:2]).all() and (points[:, 2] != point[2]).all()
+    assert 0.5 < clipped < 1.0 and points[:, 2].min() >= 0.0 and points[:, 2].max() <= 1.0
