@@ -7,6 +7,7 @@ import sys
 import numpy as np
 
 from design.methods import Method
+from design.saved_design import why_unsaved
 from design.study import Study
 from design.task import Task
 from torchfilm import displays
@@ -15,6 +16,18 @@ from torchfilm import displays
 def all_failed(study: Study) -> bool:
     """Whether no colony has come to its end."""
     return bool(study.entries) and all(len(e.reasons) == e.losses.size for e in study.entries)
+
+
+def remark_on_begin(task: Task) -> None:
+    """Say what cannot be saved, and which parameters are searched in vain."""
+    if task.tried.idle:
+        print(
+            f"nothing in the scene depends on {', '.join(task.tried.idle)}: the scene function does"
+            " not use it. Leave it out of the parameters, or give it to an effect.",
+            file=sys.stderr,
+        )
+    if why := why_unsaved(task.family.fixed):
+        print(f"the best design can be run, but not saved: {why}", file=sys.stderr)
 
 
 def remark_on_batch(task: Task, study: Study, size: float, loss: np.ndarray) -> None:

@@ -222,12 +222,18 @@ class SavedDesign:
         checks.choice(f"dtype in {self.path}", name, tuple(DTYPES))
         return DTYPES[name]
 
+    @property
+    def target(self) -> Target:
+        """The target of the search. Raises InputError where the file does not hold it, and it is
+        not given."""
+        return self._part("target", self.given_target)
+
     @cached_property
     def objective(self) -> Objective:
         """The objective that scored it. Raises InputError where the file does not hold the target
         or the parameters of the search, and they are not given."""
         parameters = self._part("parameters", self.given_parameters)
-        target = self._part("target", self.given_target)
+        target = self.target
         every, names = self.content["parameters"], self._search["names"]
         options: dict[str, Any] = {
             "fixed": {name: value for name, value in every.items() if name not in names},

@@ -126,7 +126,8 @@ class TriedScenes:
     as text. digest: of what a listing does not show, the founders and the code of functions.
     why_regrown: the reason why colonies cannot follow recorded growth, or "". why_rough: the reason
     why losses have no exact derivatives, with one option of a choice at least, or "". stochastic:
-    whether circuits count molecules one by one.
+    whether circuits count molecules one by one. idle: parameters on which nothing in the scene
+    depends.
     """
 
     founders: int
@@ -138,6 +139,7 @@ class TriedScenes:
     why_regrown: str
     why_rough: str
     stochastic: bool
+    idle: tuple[str, ...]
 
 
 def try_scenes(
@@ -157,10 +159,11 @@ def try_scenes(
     these designs are unfit.
     """
     trials = _trial_values(family.space)
-    made_of, endless, unfit, rough = [], [], [], []
+    made_of: dict[int, Any] = {}  # by the number of the trial
+    endless, unfit, rough = [], [], []
     example: tf.Scene | None = None
     stochastic = False
-    for values in trials:
+    for k, values in enumerate(trials):
         try:
             # two colonies: a tensor with one number would pass for a plain number
             scene = family.scene([values], repeat=2)
@@ -174,7 +177,7 @@ def try_scenes(
             raise _cannot_be_built(error, values, trials[0]) from error
         target.check(tried.first)
         example = example or family.scene([values])
-        made_of.append((scene.effects, scene.drawn_from))
+        made_of[k] = scene.effects, scene.drawn_from
         stochastic |= _is_stochastic(scene)
         endless.append(tried.why_endless)
         rough.append(why_rough(scene, tried.why_regrown) or target.why_rough(tried.first))
@@ -193,11 +196,23 @@ def try_scenes(
         dt=scene.dt,
         recipe=scene.recipe if ready else None,
         listing=scene.listing(),
-        digest=tf.digest(made_of),
+        digest=tf.digest(list(made_of.values())),
+        idle=_idle(family.space, made_of),
         why_regrown=why_regrown,
         why_rough=next(filter(None, rough), ""),
         stochastic=stochastic,
     )
+
+
+def _idle(space: Space, made_of: Mapping[int, Any]) -> tuple[str, ...]:
+    """The parameters that change nothing in the scene, with the others in the middle. Where there
+    are choices, a parameter may belong to another option: then none is named. made_of: what the
+    scenes of `_trial_values` are made of, by their numbers."""
+    if any(isinstance(p, Choice) for p in space.parameters) or len(made_of) <= 2 * space.size:
+        return ()
+    middle, *ends = (tf.digest(made_of[k]) for k in range(len(made_of)))
+    alike = [low == high == middle for low, high in zip(ends[::2], ends[1::2], strict=True)]
+    return tuple(name for name, same in zip(space.names, alike, strict=True) if same)
 
 
 def _cannot_be_built(

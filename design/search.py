@@ -22,8 +22,7 @@ from design.methods import METHODS, Chosen, Method, choose, designs_of, method_o
 from design.objective import Objective
 from design.progress import advance, finish, open_bar
 from design.proposal import Proposal, repeat_study
-from design.remarks import all_failed, remark_on_batch, remark_on_end
-from design.saved_design import why_unsaved
+from design.remarks import all_failed, remark_on_batch, remark_on_begin, remark_on_end
 from design.study import Study
 from design.task import Task, TaskOptions
 from design.trivial import check_within_reach
@@ -153,8 +152,7 @@ class Search(TaskOptions):
         study = None if study is None else checks.file_path("study", study)
         if self._known is not None and self._known.remark:
             print(self._known.remark, file=sys.stderr)
-        if why := why_unsaved(self.objective.task.family.fixed):
-            print(f"the best design can be run, but not saved: {why}", file=sys.stderr)
+        remark_on_begin(self.objective.task)
         chosen = self._choose(colonies, study)
         self._progress.chosen = chosen
         self._progress.study = self._open_study(study, chosen.describe())

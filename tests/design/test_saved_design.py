@@ -56,6 +56,7 @@ def test_a_loaded_design_grows_the_colonies_that_were_scored(saved):
     best, path = saved
     loaded = load_design(path, scene=lit)
     assert loaded.values == best.values and loaded.loss == best.loss
+    assert loaded.target == best.objective.task.target
     assert np.array_equal(loaded.losses, best.losses)
     for one, other in zip(loaded.colonies(), best.colonies(), strict=True):
         assert torch.equal(one.state.position, other.state.position)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchfilm as tf
-from design import Measured, Parameter, Racing, Search, Sobol
+from design import Choice, Measured, Parameter, Racing, Search, Sobol
 
 
 def makes(u, s, p, cell):
@@ -74,3 +74,23 @@ def test_a_search_says_that_small_colonies_tell_nothing_apart(capfd):
     search.run(colonies=10, progress=False)
     said = capfd.readouterr().err
     assert said.count("colonies of 0.25 of the size all have the loss 1:") == 1
+
+
+def test_a_parameter_on_which_nothing_depends_is_told(capfd):
+    def lit(k=1.0, typo=1.0) -> tf.Scene:
+        return tf.Scene(
+            tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2),
+            tf.Circuit(makes, species="m", k=k), dt=0.1,
+        )  # fmt: skip
+
+    def run(*parameters, scene=lit):
+        target = Measured({"most": most}, {"most": 1.0}, {"most": 1.0})
+        search = Search(scene, parameters, target, cells=2, replicates=1, finals=None)
+        search.run(colonies=2, progress=False)
+        return capfd.readouterr().err
+
+    k, typo = Parameter("k", 0.1, 2.0), Parameter("typo", 0.1, 2.0)
+    assert "nothing in the scene depends on typo: " in run(k, typo)
+    assert "depends on" not in run(k)
+    either = lambda k=1.0, typo=1.0, kind="a": lit(k if kind == "a" else typo)
+    assert "depends on" not in run(k, typo, Choice("kind", ["a", "b"]), scene=either)
