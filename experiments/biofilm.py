@@ -3,12 +3,14 @@
     OMP_NUM_THREADS=1 python experiments/biofilm.py                     # half a minute
     OMP_NUM_THREADS=1 python experiments/biofilm.py --hours 8 --picture runs/biofilm.png
     OMP_NUM_THREADS=1 python experiments/biofilm.py --rest              # a minute
+    OMP_NUM_THREADS=1 python experiments/biofilm.py --losses            # some seconds
 
 Colonies of the scene `biofilm`, four for each coefficient, run for 20 h. The script prints
 thickness and roughness of the films every five hours, with the standard deviation over colonies,
 and the speed at which it ran. It draws one colony of each coefficient at the end:
 docs/pictures/biofilm.png. With --rest it prints how thick films are that erode, once they have come
-to rest.
+to rest. With --losses it draws two films that erode, starve, die and slough:
+docs/pictures/biofilm_losses.png.
 """
 
 from __future__ import annotations
@@ -51,16 +53,35 @@ def at_rest() -> None:
         print(f"diffusion {diffusion:g} µm²/h: thickness {in_words(torch.stack(found).mean(0))} µm")
 
 
+def losses() -> None:
+    """Draw two films that erode, and in which cells that starve die."""
+    scene = tf.scenes.biofilm(
+        diffusion=1e4, width=40.0, first=4, erosion=[0.005, 0.02], maintenance=0.05
+    )
+    scene = scene.replace(*scene.effects, tf.Lysis(when="starvation", rate=0.2), tf.Sloughing())
+    for state in tf.simulate(scene, until=30.0, seed=1):
+        lost = state.reports["sloughing"].cells.tolist()
+        if max(lost) > 5:
+            print(f"{state.time:.2f} h: {lost} cells slough")
+        if state.step == 400:
+            pictures.show(
+                state, scene=scene, colour="growth_rate", background="nutrient", dpi=100,
+                out=PICTURE.with_name("biofilm_losses.png"),
+                title="erosion 0.005 and 0.02/(µm·h), maintenance 0.05/h, after 20 h",
+            )  # fmt: skip
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--hours", type=float, default=20.0)
     parser.add_argument("--picture", type=Path, default=PICTURE)
+    parser.add_argument("--losses", action="store_true", help="films that die at the floor")
     parser.add_argument("--rest", action="store_true", help="films that erode, at rest")
     options = parser.parse_args()
-    if options.rest:
-        at_rest()
+    if options.rest or options.losses:
+        (at_rest if options.rest else losses)()
         return
     each = torch.tensor(DIFFUSION).repeat_interleave(REPLICATES)
     scene = tf.scenes.biofilm(diffusion=each.tolist())

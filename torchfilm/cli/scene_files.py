@@ -138,11 +138,15 @@ def _run_scene_file(path: Path, what: str) -> dict[str, Any]:
 
 def _call(make: Callable[..., Any], name: str, parameters: dict[str, Any]) -> Any:
     """What a scene function returns. Raises InputError for parameters that it does not have."""
+    signature = inspect.signature(make)
     try:
-        inspect.signature(make).bind(**parameters)
+        signature.bind(**parameters)
     except TypeError as error:
+        unknown = next((n for n in parameters if n not in signature.parameters), "")
+        near = checks.suggestion(unknown, signature.parameters) if unknown else ""
         raise InputError(
-            f"{name}: {error}. Its parameters are {inspect.signature(make)}; give them with --set."
+            f"{name}: {error}. {near + ' ' if near else ''}Its parameters are {signature}; give them"
+            " with --set."
         ) from error
     return make(**parameters)
 
