@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import step
+from mock_cuda import pretended_cuda  # noqa: F401
 from ruled import same
 from scipy.stats import poisson
 
@@ -36,10 +37,13 @@ def layers(number: int, dim: int = 2, length: float = 2.0) -> tf.Cells:
     return tf.Cells(position, axis, length)
 
 
-def film(*effects: tf.Effect, dim: int = 2, cells: tf.Cells | None = None, **options) -> tf.Scene:
+def film(
+    *effects: tf.Effect, dim: int = 2, cells: tf.Cells | None = None, tolerance: float | None = None,
+    **options,
+) -> tf.Scene:  # fmt: skip
     up = tf.Plane(**{"xyz"[dim - 1]: 0.0}, facing="+" + "xyz"[dim - 1])
     periodic = {"x": (0.0, WIDTH)} | ({"y": (0.0, 6.0)} if dim == 3 else {})
-    mechanics = tf.Mechanics(dim=dim, walls=[up], periodic=periodic)
+    mechanics = tf.Mechanics(dim=dim, walls=[up], periodic=periodic, tolerance=tolerance)
     return tf.Scene(mechanics, *effects, founders=cells or layers(5, dim), **options)
 
 
@@ -220,3 +224,25 @@ def test_sloughing_needs_a_wall_and_first_cells_that_it_holds():
     high = tf.Cells([[3.0, 0.5], [3.0, 4.0]], [[1.0, 0.0]] * 2, 2.0)
     with pytest.raises(InputError, match=r"take cell 1 of colony 0 .*no chain of cells less"):
         film(tf.Sloughing(), cells=high).bind()
+
+
+def test_a_state_on_a_gpu_erodes_by_the_bits_of_the_cpu(pretended_cuda):  # noqa: F811
+    losing = (tf.Erosion([0.05, 0.2]), tf.Sloughing(), tf.Lysis(rate=0.2))
+    scene = film(tf.Growth(rate=0.5), tf.Division(length=4.0), *losing)
+    there, here = (scene.bind(2, device=name).start(seed=2) for name in ("cuda", "cpu"))
+    ended = 0
+    for _ in range(12):
+        there, here = step(scene, there, 0.05), step(scene, here, 0.05)
+        assert there.position.device.type == "cuda"
+        assert torch.equal(there.position.cpu(), here.position)
+        assert torch.equal(there.uid.cpu(), here.uid)
+        for name in ("erosion", "sloughing"):
+            one, other = (x.reports[name] for x in (there, here))
+            assert one.volume.device.type == "cuda"
+            assert torch.equal(one.volume.cpu(), other.volume)
+        ended += len(here.ended)
+    assert ended > 5
+    rate = torch.tensor([0.05, 0.2], dtype=torch.float64, requires_grad=True)
+    growing = (tf.Growth(rate=rate), tf.Division(length=4.0))
+    traced = film(*growing, *losing, tolerance=1e-5).bind(2, device="cuda")
+    assert traced.step(traced.start(seed=2), 0.05).cells > 0  # by torch, where a gradient is wanted

@@ -144,10 +144,8 @@ def _call(make: Callable[..., Any], name: str, parameters: dict[str, Any]) -> An
     except TypeError as error:
         unknown = next((n for n in parameters if n not in signature.parameters), "")
         near = checks.suggestion(unknown, signature.parameters) if unknown else ""
-        raise InputError(
-            f"{name}: {error}. {near + ' ' if near else ''}Its parameters are {signature}; give them"
-            " with --set."
-        ) from error
+        said = f"{name}: {error}. {near}".rstrip()
+        raise InputError(f"{said} Its parameters are {signature}; give them with --set.") from error
     return make(**parameters)
 
 
