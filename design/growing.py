@@ -67,6 +67,8 @@ def grow(
             row = found.new_full((count, *found.shape[1:]), torch.nan)
             notes.append(row.index_copy(0, state.colony_id, found))
         done = _at_end(state, cells, until)
+        if until is None:  # where cells do not come again
+            done = done | (state.counts == 0)
         if bool(done.any()):
             finished = _keep(state, done)
             yield FinishedColonies(finished, _history(notes, finished))

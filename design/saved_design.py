@@ -79,14 +79,21 @@ def write_design(path: Path, design: FoundDesign, *, colonies: float) -> Path:
             "losses": design.searched.tolist(),
         },
     }
-    text = json.dumps(saved, indent=1, default=_plain)
-    with warnings.catch_warnings():  # the search has given them
-        warnings.simplefilter("ignore")
-        # of the parameters as they will be read
-        scene = task.family.function(**json.loads(text)["parameters"])
-    saved |= {"effects": scene.listing(), "code": scene.code}
+    saved |= _identity(task.family.function, json.dumps(saved["parameters"], default=_plain))
     path.write_text(json.dumps(saved, indent=1, default=_plain) + "\n", encoding="utf-8")
     return path
+
+
+def _identity(function: Callable[..., tf.Scene], parameters: str) -> dict[str, Any]:
+    """By what a scene is known to be the same: of the parameters as they will be read from JSON.
+    Nothing where they do not make one, such as values by cell type, whose keys become texts."""
+    try:
+        with warnings.catch_warnings():  # the search has given them
+            warnings.simplefilter("ignore")
+            scene = function(**json.loads(parameters))
+    except Exception:
+        return {}
+    return {"effects": scene.listing(), "code": scene.code}
 
 
 def why_unsaved(fixed: Mapping[str, Any]) -> str:

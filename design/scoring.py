@@ -241,7 +241,7 @@ def _unfit(task: Task, state: tf.State, size: float) -> list[str]:
         least = max(least, math.ceil(wanted / 2))
     why = task.target.unfit(state) if size >= 1.0 else [""] * state.colonies
     for k, count in enumerate(state.counts.tolist()):
-        if count < least:
+        if count < least and (count or task.target.fewest):
             of = f"half of {wanted}" if wanted else f"the least for {type(task.target).__name__}"
             why[k] = (
                 f"it has {count} cells at {state.time:g} h, and {least}, {of}, are needed: a"

@@ -99,6 +99,8 @@ def test_colonies_grow_from_it():
         ({"length": tf.Uniform([1.0, 2.0], 3.0)}, "length.low"),
         ({"length": tf.Normal(2.0, 0.1)}, "length = Normal.*one length for each of the 30 cells"),
         ({"length": [1.0, 2.0]}, "one length for each of the 30 cells, each finite"),
+        ({"length": ["a"] * 30}, "one length for each of the 30 cells"),
+        ({"length": [[1.0], [1.0, 2.0]]}, "one length for each of the 30 cells"),
         ({"length": "2"}, "length = '2' is not allowed"),
         ({"fractions": {0: 1.0}}, "no parameter 'fractions'"),
     ],

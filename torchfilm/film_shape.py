@@ -85,8 +85,8 @@ class Floor:
 class Columns:
     """Where cells meet the middles of columns. place: (M,), the column, of all colonies one after
     the other. cell: (M,). top: (M,) float64, how high the cell reaches there, µm above the floor.
-    inside: (N,) bool, whether a cell's centre is above the floor's columns. size: how many columns
-    there are."""
+    inside: (N,) bool, whether a cell's centre is above the floor, in a column of it. size: how many
+    columns there are."""
 
     place: Tensor
     cell: Tensor
@@ -115,7 +115,7 @@ def film_of(
 def columns_of(state: State, floor: Floor) -> Columns:
     """Where the cells of a state meet the columns of a floor, above it."""
     half, radius, axis = 0.5 * state.length.double(), state.radius.double(), state.axis.double()
-    inside = torch.ones_like(state.colony, dtype=torch.bool)
+    inside = state.position[:, -1] >= floor.at
     firsts, numbers = [], []  # of the columns whose middle is within what a cell takes up
     for k, ((low, high), step) in enumerate(zip(floor.spans, floor.steps, strict=True)):
         x, wide = state.position[:, k], half * axis[:, k].abs() + radius

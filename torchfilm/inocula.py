@@ -83,9 +83,14 @@ def _lengths(given: object, count: int, colonies: int, seed: int) -> np.ndarray:
     rule = f"a number, tf.Uniform(2, 4), or one length for each of the {count} cells"
     if isinstance(given, Distribution | Mapping | str):
         raise checks.input_error("length", given, rule)
-    if np.ndim(given) == 0:  # type: ignore[arg-type]
-        return np.full((colonies, count), checks.number("length", given, least=0.0))
-    each = np.asarray(given, np.float64)
+    if isinstance(given, Tensor):
+        given = given.detach().cpu().numpy()
+    try:
+        each = np.asarray(given, np.float64)
+    except (TypeError, ValueError) as error:
+        raise checks.input_error("length", given, rule) from error
+    if each.ndim == 0:
+        return np.full((colonies, count), checks.number("length", float(each), least=0.0))
     if each.shape != (count,) or not (each >= 0).all() or not np.isfinite(each).all():
         raise checks.input_error("length", given, f"{rule}, each finite and at least 0")
     return np.tile(each, (colonies, 1))

@@ -27,7 +27,7 @@ from torchfilm import checks
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+PICTURES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,8 @@ class Image(ProfileTarget):
         floor: float = 0.0,
     ) -> Image:
         """The image in a CSV file, in which each line is a row of pixels, numbers from 0 to 1; or
-        in a picture, as PNG: its brightness from black, 0, to white, 1, where nothing shows through
-        (needs matplotlib). Raises `tf.InputError` if the file cannot be read."""
+        in a picture, PNG or JPEG: its brightness from black, 0, to white, 1; what shows through is
+        0 (needs matplotlib). Raises `tf.InputError` if the file cannot be read."""
         try:
             picture = Path(path).suffix.lower() in PICTURES
             pixels = _brightness(path) if picture else np.loadtxt(path, delimiter=",", ndmin=2)
@@ -91,7 +91,7 @@ class Image(ProfileTarget):
             raise checks.input_error(
                 "Image.load(path)",
                 str(path),
-                "a CSV file with one row of numbers a line, or a picture: PNG, JPEG, TIFF, BMP",
+                "a CSV file with one row of numbers a line, or a picture as PNG or JPEG",
                 str(error),
             ) from error
         return Image(species, pixels, size, centre=centre, floor=floor)  # type: ignore[arg-type]

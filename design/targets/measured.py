@@ -30,7 +30,8 @@ class Measured(Target):
     Loss: the mean over the measures of ((measure − wanted)/spread)², 0 within a range. It has no
     upper limit but 100², a measure 100 spreads off. A colony in which a measure is not a number has
     failed, and so has one in which no cell is left; with extinct=True that one is measured, too, as
-    where a drug is to kill all. For several processes, functions stand at the top level of a file.
+    where a drug is to kill all; among several goals, if all of them can be so. For several
+    processes, functions stand at the top level of a file.
     """
 
     failed = WORST

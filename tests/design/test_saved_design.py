@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -84,6 +86,49 @@ def test_a_design_of_another_scene_is_told(saved, tmp_path):
         warnings.simplefilter("error")
         load_design(path, scene=lit).scene()
         load_design(older, scene=dim).scene()  # code of another Python says nothing
+
+
+def by_type(make=1.0, paces=None) -> tf.Scene:
+    return lit(make).replace(tf.Growth(rate=paces), *lit(make).effects[1:])
+
+
+def test_a_scene_that_json_does_not_make_again_is_saved_all_the_same(tmp_path):
+    """The keys of values by cell type become texts."""
+    best = found(scene=by_type, parameters=LIT[:1], fixed={"paces": {0: 1.0, 1: 2.0}})
+    content = json.loads(best.save(tmp_path / "best.json").read_text())
+    assert "code" not in content and content["loss"] == best.loss
+
+
+SCRIPT = """
+import torchfilm as tf
+from design import Measured, Parameter, Search, Sobol
+class Pace:
+    def __init__(self): super().__init__(); self.value = 2.0
+PACE = Pace()
+def update(cells): cells.w = cells.w * PACE.value
+def count(state): return state.counts.double()
+def made(k=1.0):
+    return tf.Scene(tf.Rules(update, variables={"w": 1.0}), tf.Growth(rate=k), dim=2)
+if __name__ == "__main__":
+    target = Measured({"n": count}, {"n": 1.0}, {"n": 1.0})
+    search = Search(made, [Parameter("k", 1.0, 2.0)], target, until=0.1, replicates=1,
+                    finals=None, method=Sobol(batch=1))
+    search.run(1, progress=False).save("v.json")
+"""
+
+
+def test_a_scene_of_the_script_that_searched_is_the_same_where_it_is_imported(tmp_path):
+    """Its classes are those of __main__ there."""
+    (tmp_path / "script.py").write_text(SCRIPT)
+    load = (
+        "import script; from design import load_design;"
+        " load_design('v.json', scene=script.made).scene()"
+    )
+    for command in (["script.py"], ["-W", "error::UserWarning", "-c", load]):
+        done = subprocess.run(
+            [sys.executable, *command], cwd=tmp_path, capture_output=True, text=True, timeout=300
+        )
+        assert done.returncode == 0, done.stderr
 
 
 def test_a_loaded_design_is_checked_as_the_winner_itself(saved):

@@ -131,26 +131,28 @@ def dying(k=1.0) -> tf.Scene:
         cells.remove_flag = cells.chance(1 - torch.exp(-cells.p.k * cells.dt))
 
     return tf.Scene(
-        tf.Rules(update, parameters={"k": k}), founders=partial(draw, 20), dim=2, dt=0.1
-    )
+        tf.Growth(rate=2.0), tf.Division(length=4.0), tf.Rules(update, parameters={"k": k}),
+        founders=partial(draw, 20), dim=2, dt=0.1,
+    )  # fmt: skip
 
 
 def draw(count, seed):
     return tf.inoculum(count, 20.0, seed=seed)
 
 
+@pytest.mark.parametrize("end", [{"until": 1.0}, {"cells": 30, "until": 1.0}, {"cells": 30}])
 @pytest.mark.parametrize("extinct", [False, True])
-def test_colonies_in_which_all_have_died(extinct):
+def test_colonies_in_which_all_have_died(extinct, end):
     """They have failed, or are measured as they are, whatever the others of the batch do."""
     target = Measured(
         {"left": lambda state: state.counts.double()}, {"left": 0.0}, {"left": 5.0}, extinct=extinct
     )
     objective = Objective(
-        Task(dying, [Parameter("k", 0.1, 20.0)], target, until=1.0, replicates=3, seed=2)
+        Task(dying, [Parameter("k", 0.1, 20.0)], target, replicates=3, seed=2, **end)
     )
     found = objective.evaluate(np.array([[1.0], [0.0]]))
     fast = [[0.0] * 3] if extinct else [[target.failed] * 3]
-    assert found.losses[:1].tolist() == fast and (found.losses[1] < 100).all()
+    assert found.losses[:1].tolist() == fast and (found.losses[1] < 1e3).all()
     assert len(found.reasons) == (0 if extinct else 3)
     alone = objective.evaluate(np.array([[1.0]]))
     assert np.array_equal(alone.losses, found.losses[:1])

@@ -294,7 +294,7 @@ def test_image_from_a_picture(kind, tmp_path):
     found = Image.load(path, "yfp", (12.0, 8.0))
     np.testing.assert_allclose(found.mask, levels / 255, atol=0.02 if kind == "jpg" else 1e-6)
     path.write_text("no picture")
-    with pytest.raises(tf.InputError, match="or a picture: PNG"):
+    with pytest.raises(tf.InputError, match="or a picture as PNG"):
         Image.load(path, "yfp", (12.0, 8.0))
 
 

@@ -38,8 +38,8 @@ def layers(number: int, dim: int = 2, length: float = 2.0) -> tf.Cells:
 
 
 def film(
-    *effects: tf.Effect, dim: int = 2, cells: tf.Cells | None = None, tolerance: float | None = None,
-    **options,
+    *effects: tf.Effect, dim: int = 2, cells: tf.Cells | None = None,
+    tolerance: float | None = None, **options,
 ) -> tf.Scene:  # fmt: skip
     up = tf.Plane(**{"xyz"[dim - 1]: 0.0}, facing="+" + "xyz"[dim - 1])
     periodic = {"x": (0.0, WIDTH)} | ({"y": (0.0, 6.0)} if dim == 3 else {})
@@ -66,6 +66,24 @@ def test_a_film_loses_volume_by_the_law(order, dt, steps):
         total += float(law.mean())
     error = float(differences.std()) / math.sqrt(1000)
     assert 0 < 4 * error < 0.1 * total and abs(float(differences.mean())) < 4 * error
+
+
+def test_heights_count_from_the_floor_and_so_does_what_erodes():
+    """Above a floor at 5 µm the upper half of ten layers erodes as five layers above one at 0 do:
+    what is below it bears nothing."""
+    lost = []
+    for number, at in ((5, 0.0), (10, 5.0)):
+        scene = film(tf.Erosion(0.1, order=1.0, floor=at), cells=layers(number))
+        state = step(scene, scene.bind(1000).start(seed=3), 0.5)
+        lost.append(state.reports["erosion"].volume)
+    error = math.hypot(*(float(x.std()) / math.sqrt(1000) for x in lost))
+    one, other = (float(x.mean()) for x in lost)
+    assert abs(one - other) < 4 * error < 0.2 * one
+
+
+def test_any_rate_takes_what_can_be_seen():
+    scene = film(tf.Erosion(1e300))
+    assert step(scene, scene.bind().start(), 0.1).cells == 0
 
 
 def test_a_long_step_erodes_what_comes_to_light():

@@ -419,6 +419,7 @@ def test_bad_input(given, words):
             r"lysis needs the field 'toxn'.*Did you mean 'toxin'.*variables=\{'toxn': 0.0\}",
         ),
         ({"rate": 1.0, "factor": "toxn"}, "lysis needs the field 'toxn'.*Did you mean 'toxin'"),
+        ({"hazard": "growth_rate"}, "only for it. growth_rate is in 1/h, and would be 0"),
         ({"hazard": "toxn"}, "lysis needs the field 'toxn'.*Did you mean 'toxin'"),
         ({"when": "toxin", "releases": {"colicin": "toxin"}}, "the Medium has toxin, ahl"),
         ({"when": "toxin", "releases": {"toxin": "colicin"}}, "lysis needs the field 'colicin'"),

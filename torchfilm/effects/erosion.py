@@ -15,9 +15,12 @@ from torchfilm.resolver import Values
 from torchfilm.signals.schedule import warn_of_steps
 from torchfilm.state import State
 from torchfilm.tools import checks
+from torchfilm.tools.deterministic_math import power
 from torchfilm.tools.random import fine_uniform
 from torchfilm.tools.read_only import read_only
 from torchfilm.values import COLONY, Value, physical
+
+MOST = 1e200  # chance of a cell to leave, per h
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +39,7 @@ class Erosion(Effect):
 
     spacing: width of a column, µm. floor: its y in the plane, or z in space, µm. across: from where
     to where it reaches, µm, such as {"x": (0, 60)}; left out along an axis that is periodic. Cells
-    beyond stay.
+    that are above none of its columns stay.
 
     The lineage keeps the end of these cells, with the fate "eroded"; `state.reports["erosion"]` has
     their number and volume.
@@ -120,7 +123,9 @@ class Erosion(Effect):
         exposed = torch.nonzero(stacks.there).squeeze(1)
         while len(exposed):
             cell = stacks.cell().index_select(0, exposed)
-            chance = (falls * stacks.height() ** self.order).index_select(0, exposed) / volume[cell]
+            height = power(stacks.height(), self.order)
+            chance = (falls * height).index_select(0, exposed) / volume[cell]
+            chance = chance.clamp(max=MOST)  # whatever the rate, a number
             hazard = hazard + torch.bincount(cell, chance, minlength=state.cells)
             late = late + torch.bincount(cell, chance * since[exposed], minlength=state.cells)
             end = (draw + late) / hazard

@@ -23,6 +23,7 @@ from torchfilm.values import CONCENTRATION, Rule, Value, checked, physical
 
 AMOUNT = Rule("conc·µm³", least=0.0, scheduled=True)
 LENGTH, VOLUME = "length", "volume"
+SUMS = (CONCENTRATION, "")  # units of species and variables, which may add up a hazard
 _NO_LEVELS = ("radius", "position", "axis", "area", "cells")
 _OF_SHAPE = (
     "a species or a variable; of a cell's shape, `when` knows length and volume, `releases` volume"
@@ -197,6 +198,12 @@ class Lysis(Effect):
     def check(self, state: State, values: Values) -> None:
         for name in self._variables():
             check_variable("Lysis", name, state, at_least_zero=name in self.at_least_zero())
+        if self.hazard is not None and (unit := state.declared[self.hazard].unit) not in SUMS:
+            raise checks.input_error(
+                "Lysis.hazard", self.hazard,
+                "a species of a circuit, or a variable of rules, that is only for it",
+                f"{self.hazard} is in {unit}, and would be 0 after each step.",
+            )  # fmt: skip
 
 
 class BoundLysis(BoundEffect):

@@ -218,10 +218,14 @@ class BoundMonod(BoundEffect):
         # with what it will grow by the parts that are done
         earlier = (state.growth_rate if done else torch.zeros_like(state.growth_rate)).double()
         needed = self._needed(state)
-        # half of what a part's maintenance takes off is off in its middle
-        eaters = self._eaters(
-            state, medium, torch.exp(earlier * (dt * number) - 0.5 * dt * needed), dt
-        )
+        growth = torch.exp(earlier * (dt * number))
+        eaters = self._eaters(state, medium, growth, dt)
+        if effect.maintenance is not None:
+            # in the middle of the part half of it is off, of cells that starve half of the growth
+            found = medium.found[signal].double()
+            gross = eaters.greatest * found / (eaters.half + found)
+            off = torch.exp(-0.5 * dt * torch.minimum(needed, gross))
+            eaters = dataclasses.replace(eaters, volume=eaters.volume * off)
         taken = uptake.solve(
             eaters, state.layout.grid, self.transport.with_uptake(signal, state),
             state.fields[OUTSIDE + signal], medium.found[signal],

@@ -6,8 +6,10 @@ import dataclasses
 import dis
 import hashlib
 import re
+import sys
 from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from types import CodeType, FunctionType, MethodType
 from typing import Any
 
@@ -102,7 +104,7 @@ def _parts(thing: Any) -> list[Any]:
         or not (hasattr(thing, "__dict__") or _slots(thing))
         or type(thing).__module__ == "builtins"
     ):
-        return [without_addresses(repr(thing))]
+        return [_imported(without_addresses(repr(thing)))]
     kind = type(thing)
     if dataclasses.is_dataclass(thing):
         # fields without repr are derived, not given by the user
@@ -119,6 +121,14 @@ def _parts(thing: Any) -> list[Any]:
         *given,
         *(f for c in own for f in vars(c).values() if isinstance(f, FunctionType)),
     ]
+
+
+def _imported(text: str) -> str:
+    """A repr in which a class of the script that runs is named as where the script is imported."""
+    main = getattr(sys.modules.get("__main__"), "__file__", None)
+    return (
+        text if main is None else text.replace("<class '__main__.", f"<class '{Path(main).stem}.")
+    )
 
 
 def _is_plain_object(thing: Any) -> bool:

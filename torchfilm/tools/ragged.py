@@ -51,7 +51,7 @@ def offsets(counts: Tensor) -> Tensor:
 def repeated(value: Tensor, count: Tensor, total: int | None = None) -> Tensor:
     """Each integer (K,) as often as `count` (K,) says; total: how many that are, where the host
     knows it."""
-    if value.device.type != "cpu":
+    if value.device.type != "cpu" or value.dtype != torch.float32:
         return torch.repeat_interleave(value, count, output_size=total)
     # torch's own wakes all threads, even for a few numbers; on a busy machine it waits for them
     return torch.from_numpy(np.repeat(value.numpy(), count.numpy()))
