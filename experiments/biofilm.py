@@ -27,6 +27,7 @@ from torchfilm import pictures
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "biofilm.png"
 DIFFUSION, REPLICATES, SEED = (1e3, 3e3, 1e4, 1e5), 4, 0
+MANY = 20  # cells that slough at once
 EROSION, AT_REST, END = (0.005, 0.01, 0.02, 0.04), 25.0, 40.0  # 1/(µm·h), h, h
 
 
@@ -54,21 +55,24 @@ def at_rest() -> None:
 
 
 def losses() -> None:
-    """Draw two films that erode, and in which cells that starve die."""
+    """Draw two films that erode, and in which cells that starve die, before one of them sloughs."""
     scene = tf.scenes.biofilm(
         diffusion=1e4, width=40.0, first=4, erosion=[0.005, 0.02], maintenance=0.05
     )
     scene = scene.replace(*scene.effects, tf.Lysis(when="starvation", rate=0.2), tf.Sloughing())
-    for state in tf.simulate(scene, until=30.0, seed=1):
-        lost = state.reports["sloughing"].cells.tolist()
-        if max(lost) > 5:
+    before = None
+    for state in tf.simulate(scene, until=40.0, seed=1):
+        lost = int(state.reports["sloughing"].cells.max())
+        if lost > MANY and before is not None:
             print(f"{state.time:.2f} h: {lost} cells slough")
-        if state.step == 400:
-            pictures.show(
-                state, scene=scene, colour="growth_rate", background="nutrient", dpi=100,
-                out=PICTURE.with_name("biofilm_losses.png"),
-                title="erosion 0.005 and 0.02/(µm·h), maintenance 0.05/h, after 20 h",
-            )  # fmt: skip
+            break
+        before = state
+    assert before is not None
+    pictures.show(
+        before, scene=scene, colour="growth_rate", background="nutrient", dpi=100,
+        out=PICTURE.with_name("biofilm_losses.png"),
+        title="erosion 0.005 and 0.02/(µm·h), maintenance 0.05/h",
+    )  # fmt: skip
 
 
 def main() -> None:
