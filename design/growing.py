@@ -40,14 +40,14 @@ def grow(
     cells: int | None,
     until: float | None,
     note: Callable[[tf.State], Tensor | None],
-    empty: bool = False,
+    fewest: int = 1,
 ) -> Iterator[FinishedColonies | FailedColony]:
     """Step a batch until each colony reaches its end: `cells` cells or `until` h, whichever comes
     first.
 
     The end of a colony depends on that colony alone, so its result does not depend on its batch.
-    note: called after every step; see `Target.note` and `Target.course`. empty: whether a colony
-    without cells goes on to its end; else it has failed.
+    note: called after every step; see `Target.note` and `Target.course`. fewest: see `Target`;
+    with 0 a colony without cells goes on to its end, else it has failed.
     """
     state = prepared.first
     count = state.colonies
@@ -57,7 +57,7 @@ def grow(
     running = tf.advance(prepared.step, state)
     state = next(running)
     while True:
-        failed, gone = _failed(state, empty)
+        failed, gone = _failed(state, fewest)
         yield from failed
         if bool(gone.all()):
             return
@@ -81,7 +81,7 @@ def grow(
         state = running.send(_keep(state, ~gone))
 
 
-def _failed(state: tf.State, may_be_empty: bool) -> tuple[list[FailedColony], Tensor]:
+def _failed(state: tf.State, fewest: int) -> tuple[list[FailedColony], Tensor]:
     """The colonies that failed in the last step, or have no cells where they must have some, and a
     mask of them, (B,)."""
     failures = colonies.failures(state)
@@ -91,7 +91,7 @@ def _failed(state: tf.State, may_be_empty: bool) -> tuple[list[FailedColony], Te
     ]
     gone = torch.zeros(state.colonies, dtype=torch.bool, device=state.device)
     gone[list(failures)] = True
-    if may_be_empty:
+    if fewest == 0:
         return out, gone
     empty = (state.counts == 0) & ~gone
     out += [

@@ -191,8 +191,8 @@ def _grow_and_score(
         reasons: dict[tuple[int, int], str] = {}
         most_cells, until = task.end(size)
         note = task.target.course if item.tangents else task.target.note
-        empty = task.target.fewest == 0
-        for event in grow(prepared, cells=most_cells, until=until, note=note, empty=empty):
+        fewest = task.target.fewest
+        for event in grow(prepared, cells=most_cells, until=until, note=note, fewest=fewest):
             if not isinstance(event, FinishedColonies):
                 reasons[divmod(event.colony_id // copies, replicates)] = event.reason
                 continue
@@ -287,6 +287,6 @@ def finished_colonies(
     except tf.InputError:  # the scene refuses this design
         return []
     cells, until = task.end(1.0)
-    empty = task.target.fewest == 0
-    events = grow(prepared, cells=cells, until=until, note=task.target.note, empty=empty)
+    target = task.target
+    events = grow(prepared, cells=cells, until=until, note=target.note, fewest=target.fewest)
     return [e for e in events if isinstance(e, FinishedColonies)]

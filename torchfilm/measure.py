@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchfilm.contact_forces import bonds_of, pushed_by_cells, pushed_by_walls, softness
 from torchfilm.film_shape import Film, film_of
-from torchfilm.physics.nearby import gaps_nearby
+from torchfilm.physics.nearby import gaps_nearby, pairs_within
 from torchfilm.physics.surfaces import FlatSurface
 from torchfilm.physics.walls import Wall, depth_in_walls
 from torchfilm.state import CELL, State
@@ -350,18 +350,8 @@ def neighbours(state: State, gap: float) -> tuple[Tensor, Tensor, Tensor]:
     at opposite faces are neighbours, too.
     """
     checks.number("neighbours(gap)", gap, least=0.0)
-    i, j, apart = gaps_nearby(
-        state.position,
-        state.axis,
-        state.length,
-        state.radius,
-        state.colony,
-        state.colonies,
-        within=gap,
-        space=state.space,
-    )
-    near = torch.nonzero(apart < gap).squeeze(1)
-    i, j = i.index_select(0, near), j.index_select(0, near)
+    cells = state.position, state.axis, state.length, state.radius, state.colony, state.colonies
+    i, j = pairs_within(*cells, gap, state.space)
     between = (state.position.index_select(0, j) - state.position.index_select(0, i)).T
     if state.space is not None:
         between = between + state.space.shift(between)

@@ -28,11 +28,11 @@ class Racing(AskTell):
     but the last. agree: the race is skipped where the order of the finalists in small and full
     colonies agrees less than this (Kendall's tau, smoothed over races, from 1). Then as many points
     as `inner` needs are grown to full size at once. -1 never skips. Where small colonies all have
-    one loss, as where the pattern does not fit into them, there is no race any more. A new
-    cloud of CMAES trusts small colonies again; a model does not. first: finalists of a race from
-    which a cloud or a model is to begin, since the best of them counts most there; before them,
-    `keep` chooses among full
-    colonies of `small` replicates. A cloud that needs no more losses has a race like all others.
+    one loss, as where the pattern does not fit into them, there is no race any more. A new cloud of
+    CMAES trusts small colonies again; a model does not. first: finalists of a race from which a
+    cloud or a model is to begin, since the best of them counts most there; before them, `keep`
+    chooses among full colonies of `small` replicates. A cloud that needs no more losses has a race
+    like all others.
 
     A race is one bracket of successive halving (Jamieson and Talwalkar, AISTATS 2016), and a
     pre-selection for CMA-ES (Ulmer, Streichert and Zell, CEC 2003): all points come from the

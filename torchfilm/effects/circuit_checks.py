@@ -14,6 +14,7 @@ from torchfilm.circuits.reactions import Reaction
 from torchfilm.signals.schedule import Schedule
 from torchfilm.state import PER_CELL, RESERVED
 from torchfilm.tools import checks
+from torchfilm.tools.row_checks import is_name
 from torchfilm.tools.warn_once import warn
 from torchfilm.values import FORMS
 
@@ -51,20 +52,16 @@ def names_of(species: Sequence[str], what: str = "species") -> tuple[str, ...]:
             hint += f" First levels go into initial={dict(species)}."
         raise checks.input_error(given, species, rule, hint)
     names = (species,) if isinstance(species, str) else tuple(species)
-    wrong = [n for n in names if not _is_name(n)]
+    wrong = [n for n in names if not is_name(n)]
     if wrong:
         apart = tuple(species.replace(",", " ").split()) if isinstance(species, str) else ()
         hint = f"{wrong[0]!r} is none: it may have letters, digits and _ only, as in u.NAME."
-        if apart and all(map(_is_name, apart)):
+        if apart and all(map(is_name, apart)):
             hint = f"Pass a tuple of names: {what}={apart}."
         raise checks.input_error(given, species, rule, hint)
     if not names or len(set(names)) < len(names):
         raise checks.input_error(given, species, rule)
     return names
-
-
-def _is_name(given: Any) -> bool:
-    return isinstance(given, str) and given.isidentifier()
 
 
 def check_species(names: tuple[str, ...], shared: Mapping[str, str]) -> None:

@@ -95,7 +95,8 @@ class Erosion(Effect):
         rate = values.rate.of_colonies(state)
         if state.cells and bool((rate > 0).any()):
             # on the CPU, where sums over columns have an order
-            gone = self._eroded(state.to("cpu"), rate.double().cpu(), dt).to(state.device)
+            here = state if state.device.type == "cpu" else state.to("cpu")
+            gone = self._eroded(here, rate.double().cpu(), dt).to(state.device)
         report = CellsLost.of(state, gone)
         state = state.replace(reports={**state.reports, self.title: report})
         return state.remove(gone, "eroded")
@@ -122,16 +123,17 @@ class Erosion(Effect):
         hazard, late = torch.zeros_like(volume), torch.zeros_like(volume)
         exposed = torch.nonzero(stacks.there).squeeze(1)
         while len(exposed):
-            cell = stacks.cell().index_select(0, exposed)
-            height = power(stacks.height(), self.order)
-            chance = (falls * height).index_select(0, exposed) / volume[cell]
+            top = stacks.cell()
+            cell = top.index_select(0, exposed)
+            height = power(stacks.height().index_select(0, exposed), self.order)
+            chance = falls.index_select(0, exposed) * height / volume[cell]
             chance = chance.clamp(max=MOST)  # whatever the rate, a number
             hazard = hazard + torch.bincount(cell, chance, minlength=state.cells)
             late = late + torch.bincount(cell, chance * since[exposed], minlength=state.cells)
             end = (draw + late) / hazard
             gone = gone | (end <= dt)
-            bare = torch.nonzero(stacks.there & gone[stacks.cell()]).squeeze(1)
-            since[bare] = torch.maximum(since[bare], end[stacks.cell()[bare]])
+            bare = torch.nonzero(stacks.there & gone[top]).squeeze(1)
+            since[bare] = torch.maximum(since[bare], end[top[bare]])
             exposed = stacks.below(bare, gone)
         return gone
 

@@ -18,7 +18,7 @@ from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.random import fine_uniform
 from torchfilm.tools.read_only import read_only
-from torchfilm.tools.row_checks import check_names, check_variable
+from torchfilm.tools.row_checks import check_names, check_variable, is_name
 from torchfilm.values import CONCENTRATION, Rule, Value, checked, physical
 
 AMOUNT = Rule("conc·µm³", least=0.0, scheduled=True)
@@ -119,7 +119,7 @@ class Lysis(Effect):
             raise checks.input_error(
                 "Lysis.above", self.above, "given with `when`, the name of what is to exceed it"
             )
-        if self.when is not None and not _is_name(self.when):
+        if self.when is not None and not is_name(self.when):
             raise checks.input_error(
                 "Lysis.when", self.when, "the name of a species or a variable of the cells"
             )
@@ -136,10 +136,10 @@ class Lysis(Effect):
     def _checked_release(self, signal: object, what: Any) -> Any:
         """A tuple of names, or a checked amount."""
         path = f"Lysis.releases[{signal!r}]"
-        if not _is_name(signal):
+        if not is_name(signal):
             raise checks.input_error("Lysis.releases", signal, "keys that name signals")
         names = tuple(what) if isinstance(what, tuple | list) else (what,)
-        if names and all(map(_is_name, names)):
+        if names and all(map(is_name, names)):
             if {LENGTH, *_NO_LEVELS} & {*names}:
                 raise checks.input_error(path, what, _OF_SHAPE)
             if len(set(names)) < len(names):
@@ -329,7 +329,3 @@ def _is_species(state: State, name: str) -> bool:
     """Whether it is a concentration in each cell."""
     declared = state.declared.get(name)
     return declared is not None and declared.scope == CELL and declared.unit == CONCENTRATION
-
-
-def _is_name(given: object) -> bool:
-    return isinstance(given, str) and given.isidentifier()

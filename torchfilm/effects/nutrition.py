@@ -211,16 +211,15 @@ class BoundMonod(BoundEffect):
     def _part(self, state: State, dt: float, done: int, number: int) -> State:
         """The state after dt hours of uptake and transport, one of a `number` of parts of a step,
         of which so many are `done`. Cells grow by it after the last."""
-        effect, signal = self.effect, self.effect.signal
+        signal = self.effect.signal
         medium = MediumExchange(state, (signal,))
         medium.find()
         assert state.layout is not None
         # with what it will grow by the parts that are done
         earlier = (state.growth_rate if done else torch.zeros_like(state.growth_rate)).double()
-        needed = self._needed(state)
-        growth = torch.exp(earlier * (dt * number))
-        eaters = self._eaters(state, medium, growth, dt)
-        if effect.maintenance is not None:
+        eaters = self._eaters(state, medium, torch.exp(earlier * (dt * number)), dt)
+        needed = self._maintenance(state)
+        if needed is not None:
             # in the middle of the part half of it is off, of cells that starve half of the growth
             found = medium.found[signal].double()
             gross = eaters.greatest * found / (eaters.half + found)
@@ -231,14 +230,15 @@ class BoundMonod(BoundEffect):
             state.fields[OUTSIDE + signal], medium.found[signal],
         )  # fmt: skip
         grown = torch.log1p(eaters.gain * taken.amount / eaters.volume) / (dt * number)
-        left = grown - needed / number
         own = f"{signal}_eaten"
         changed = {
             OUTSIDE + signal: taken.end,
-            "growth_rate": earlier + (grown if effect.maintenance is None else left.clamp(min=0.0)),
+            "growth_rate": earlier + grown,
             own: state.fields[own] + taken.amount,
         }
-        if effect.maintenance is not None:
+        if needed is not None:
+            left = grown - needed / number
+            changed["growth_rate"] = earlier + left.clamp(min=0.0)
             lacking = (-left).clamp(min=0.0)
             changed[STARVATION] = state.fields[STARVATION] + lacking if done else lacking
         total = lambda amount: state.groups.sum(amount)
@@ -251,10 +251,10 @@ class BoundMonod(BoundEffect):
             reports={**state.reports, "nutrition": note}
         )  # fmt: skip
 
-    def _needed(self, state: State) -> Tensor:
-        """Maintenance of each cell, (N,) float64 1/h."""
+    def _maintenance(self, state: State) -> Tensor | None:
+        """Of each cell, (N,) float64 1/h; None where the scene asks for none."""
         if self.effect.maintenance is None:
-            return torch.zeros_like(state.length, dtype=torch.float64)
+            return None
         return self.values.maintenance.of_cells(state).double().expand(state.cells)
 
     def _eaters(

@@ -13,6 +13,7 @@ from torchfilm.effect import REMOVAL, Effect
 from torchfilm.resolver import Values
 from torchfilm.state import State
 from torchfilm.tools import checks
+from torchfilm.tools.row_checks import check_none_taken
 from torchfilm.values import COLONY, Rule
 
 
@@ -57,15 +58,8 @@ class Removal(Effect):
             raise checks.input_error(
                 "Removal.low", self.low, f"of {state.dim} numbers in a {state.dim}-D scene"
             )
-        outside = self._outside(state, values)
-        if bool(outside.any()):
-            k = int(torch.nonzero(outside)[0])
-            raise checks.InputError(
-                f"Removal would take cell {int(state.uid[k])} of colony"
-                f" {int(state.own_colony_id[k])} before the first step: it starts at"
-                f" {state.position[k].tolist()}, outside {self.low} to {self.high}. Move the cell"
-                " or the region."
-            )
+        why = f"outside {self.low} to {self.high}. Move the cell or the region."
+        check_none_taken("Removal", state, self._outside(state, values), why)
 
     def _outside(self, state: State, values: Values) -> torch.Tensor:
         outside = torch.zeros(state.cells, dtype=torch.bool, device=state.device)

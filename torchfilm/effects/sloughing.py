@@ -9,13 +9,14 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import SLOUGHING, Binding, BoundEffect, Effect
-from torchfilm.physics.nearby import gaps_nearby
+from torchfilm.physics.nearby import pairs_within
 from torchfilm.physics.surfaces import Surface
 from torchfilm.physics.walls import depth_in_surfaces
 from torchfilm.reports import CellsLost
 from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.connected import components
+from torchfilm.tools.row_checks import check_none_taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,15 +70,11 @@ class BoundSloughing(BoundEffect):
 
     def check(self, state: State) -> None:
         super().check(state)
-        loose = self._loose(state)
-        if bool(loose.any()):
-            k = int(torch.nonzero(loose)[0])
-            raise checks.InputError(
-                f"Sloughing would take cell {int(state.uid[k])} of colony"
-                f" {int(state.own_colony_id[k])} before the first step: from"
-                f" {[round(x, 3) for x in state.position[k].tolist()]} no chain of cells less than"
-                f" {self.effect.gap:g} µm apart leads to a wall. Move the cell, or raise the gap."
-            )
+        check_none_taken(
+            "Sloughing", state, self._loose(state),
+            f"from where no chain of cells less than {self.effect.gap:g} µm apart leads to a wall."
+            " Move the cell, or raise the gap.",
+        )  # fmt: skip
 
     def step(self, state: State, dt: float) -> State:
         loose = self._loose(state)
@@ -89,11 +86,8 @@ class BoundSloughing(BoundEffect):
     def _loose(self, state: State) -> Tensor:
         """The cells that nothing holds, (N,) bool."""
         gap, shape = self.effect.gap, (state.position, state.axis, state.length, state.radius)
-        i, j, apart = gaps_nearby(
-            *shape, state.colony, state.colonies, within=gap, space=state.space
-        )
-        near = torch.nonzero(apart < gap).squeeze(1)
-        of = components(i.index_select(0, near), j.index_select(0, near), state.cells)
+        pairs = pairs_within(*shape, state.colony, state.colonies, gap, state.space)
+        of = components(*pairs, state.cells)
         reach = state.radius.double() + gap
         at_walls = depth_in_surfaces(self.surfaces, *shape[:3], reach, state.own_colony_id) > 0
         held = torch.zeros(state.cells, dtype=torch.bool, device=state.device)

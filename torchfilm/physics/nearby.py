@@ -45,5 +45,23 @@ def gaps_nearby(
     return key // count, key % count, least
 
 
+def pairs_within(
+    position: Tensor,
+    axis: Tensor,
+    length: Tensor,
+    radius: Tensor,
+    colony: Tensor,
+    colonies: int,
+    gap: float,
+    space: PeriodicSpace | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Pairs of one colony whose surfaces are less than `gap` µm apart: first and second, (P,). The
+    rest as for `gaps_nearby`."""
+    cells = position, axis, length, radius, colony, colonies
+    first, second, apart = gaps_nearby(*cells, within=gap, space=space)
+    near = torch.nonzero(apart < gap).squeeze(1)
+    return first.index_select(0, near), second.index_select(0, near)
+
+
 def _capsules(position: Tensor, axis: Tensor, length: Tensor, radius: Tensor) -> Capsules:
     return Capsules(position.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius)

@@ -170,10 +170,26 @@ def check_signals(fields: Mapping[str, Tensor]) -> None:
             raise checks.input_error(f"the field {name!r}, a signal,", bad, "0 or more everywhere")
 
 
+def check_none_taken(owner: str, state: Any, taken: Any, why: str) -> None:
+    """Raise InputError where an effect would take a cell of a first state: where `taken` (N,) is
+    true. why: after where it starts; and what to do."""
+    if bool(taken.any()):
+        k = int(taken.nonzero()[0])
+        raise checks.InputError(
+            f"{owner} would take cell {int(state.uid[k])} of colony {int(state.own_colony_id[k])}"
+            f" before the first step: it starts at {state.position[k].tolist()}, {why}"
+        )
+
+
+def is_name(given: object) -> bool:
+    """Whether it may name a species or a variable."""
+    return isinstance(given, str) and given.isidentifier()
+
+
 def check_names(owner: str, **given: Any) -> None:
     """Raise InputError unless each is None or a name that a species or a variable may have."""
     for option, name in given.items():
-        if name is not None and not (isinstance(name, str) and name.isidentifier()):
+        if name is not None and not is_name(name):
             rule = "the name of a species or a variable of the cells"
             raise checks.input_error(f"{owner}.{option}", name, rule)
 
