@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_operator import BOUNDARIES, FLOWS, SHAPES, make
+from test_operator import BOUNDARIES, FLOWS, SHAPES, operator_of
 
 import torchfilm as tf
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Periodic
@@ -44,7 +44,7 @@ def roundings(shape) -> int:
 @pytest.mark.parametrize("faces", BOUNDARIES)
 @pytest.mark.parametrize("kind", FLOWS[:2])
 def test_exponential_is_that_of_torch(dtype, shape, faces, kind, dt):
-    op, *_ = make(shape, faces, kind, dtype=dtype)
+    op, *_ = operator_of(shape, faces, kind, dtype=dtype)
     stepper = prepare(op, dt, "exponential")
     u = torch.rand(1, *shape, dtype=dtype, generator=torch.Generator().manual_seed(1))
     one, other = stepper.step(u), by_kernel(stepper, u)
@@ -80,7 +80,7 @@ def test_far_from_a_source_nothing_is_subnormal(dtype, method):
 def test_series_is_that_of_torch(dtype, shape, faces, masked, dt):
     """Both add in float64 in one order, but for what passes through periodic faces, and round once
     to the type of the field. float64: two roundings more for each of up to 700 terms."""
-    op, _, _, mask = make(shape, faces, "varying", masked, dtype=dtype)
+    op, mask, _ = operator_of(shape, faces, "varying", masked, dtype=dtype)
     stepper = prepare(op, dt, "series")
     u = torch.rand(1, *shape, dtype=dtype, generator=torch.Generator().manual_seed(1))
     u = u * torch.as_tensor(mask)
@@ -116,7 +116,7 @@ def test_a_long_series_loses_nothing(dtype, dt):
 def test_a_solve_is_that_of_torch(dtype, shape, faces, kind, masked):
     """Steps too long for a series, with conjugate gradients and with BiCGStab. Both leave 1e-10 of
     the norm of the right-hand side, and then add it; the inverse makes it no larger."""
-    op, _, _, mask = make(shape, faces, kind, masked, dtype=dtype)
+    op, mask, _ = operator_of(shape, faces, kind, masked, dtype=dtype)
     dt = 3.0 * MOST / float(op.loss.max())
     stepper = prepare(op, dt, "series")
     assert bool(stepper.far.all()) and op.symmetric == (kind == "still")

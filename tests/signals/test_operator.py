@@ -115,23 +115,14 @@ def flow(kind: str, shape, rng) -> tuple[object, list[np.ndarray]]:
     ]
 
 
-def make(
-    shape,
-    faces="mixed",
-    kind="uniform",
-    masked=False,
-    diffusion=1.3,
-    decay=0.2,
-    source=0.3,
-    dtype=torch.float64,
-    device="cpu",
-    seed=0,
-):
-    """An operator, with its matrix and gain from `assembled`."""
+def operator_of(
+    shape, faces="mixed", kind="uniform", masked=False, diffusion=1.3, decay=0.2, source=0.3,
+    dtype=torch.float64, device="cpu", seed=0,
+):  # fmt: skip
+    """An operator, its mask, and the velocities at its faces."""
     rng = np.random.default_rng(seed)
     velocity, arrays = flow(kind, shape, rng)
     mask = rng.uniform(size=shape) < 0.7 if masked else np.ones(shape, dtype=bool)
-    chosen = BOUNDARIES[faces]
     if isinstance(velocity, tuple) and isinstance(velocity[0], torch.Tensor):
         velocity = tuple(v.to(device) for v in velocity)
     made = build_operator(
@@ -140,12 +131,28 @@ def make(
         diffusion=diffusion,
         decay=decay,
         velocity=velocity,
-        boundary=chosen,
+        boundary=BOUNDARIES[faces],
         source=source,
         dtype=dtype,
         device=device,
         mask=torch.as_tensor(mask, device=device) if masked else None,
     )
+    return made, mask, arrays
+
+
+def make(
+    shape,
+    faces="mixed",
+    kind="uniform",
+    masked=False,
+    diffusion=1.3,
+    decay=0.2,
+    source=0.3,
+    **other,
+):
+    """An operator, with its matrix and gain from `assembled`."""
+    made, mask, arrays = operator_of(shape, faces, kind, masked, diffusion, decay, source, **other)
+    chosen = BOUNDARIES[faces]
     return made, *assembled(shape, SPACING, diffusion, decay, arrays, chosen, mask, source), mask
 
 
