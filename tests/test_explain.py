@@ -215,7 +215,8 @@ def test_who_computes_contacts_is_who_is_reported(backend, contacts, monkeypatch
     model.step(model.start(), 0.025)
     by_torch = backend == "torch"
     assert called == [contacts if by_torch else "compiled"]
-    said = "torch," if by_torch else "compiled; by torch where gradients are required,"
+    by = "by" if contacts == "bilateral" else "assembled by"
+    said = "torch," if by_torch else f"compiled; {by} torch where gradients are required,"
     assert f"conjugate gradients, {said}" in " ".join(effect.numerics(0.025, model.start()))
 
 

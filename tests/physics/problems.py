@@ -9,10 +9,10 @@ import torch
 from helpers import array
 from scipy.optimize import minimize
 
-from torchfilm.kernels import bilateral_solve, solve
+from torchfilm.kernels import bilateral_solve
 from torchfilm.kernels.compiling import for_python
 from torchfilm.kernels.memory import no_memory
-from torchfilm.physics import one_sided_solve
+from torchfilm.physics import compiled_solve, one_sided_solve
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.one_sided_solve import Minimum
 from torchfilm.physics.problem import ContactProblem, SolveReport
@@ -138,21 +138,16 @@ class Problem:
         )
 
     def pushed_by_kernels(
-        self, tolerance: float = 1e-12, limit: int = 5000, dtype=np.float64, applied_force=None
+        self, tolerance: float = 1e-12, limit: int = 5000, dtype=np.float64, **options
     ):
         """As `pushed` by compiled kernels: y (N, D), errors and iterations, (B,)."""
-        y, errors, counts = np.zeros(self.scale.shape), [], []
-        for mine, rows, (alpha, low), cells, dof in self.of_kernels(dtype, applied_force):
-            if applied_force is None:  # no row has pushed before
-                rows = (*rows[:-1], rows[-1][:0])
-            iterations, error, _ = for_python(solve.minimise)(
-                no_memory(), *rows, alpha, low, cells, tolerance, np.inf, limit,
-                np.zeros(0, np.int64), dof,
-            )  # fmt: skip
-            y[mine] = cells[:, : y.shape[1]]
-            errors.append(error)
-            counts.append(iterations)
-        return y, np.array(errors), np.array(counts)
+        in_torch = torch.float64 if dtype == np.float64 else torch.float32
+        problem = self.problem(in_torch, **options)
+        cap = torch.full((self.colonies,), torch.inf, dtype=torch.float64)
+        found = compiled_solve.minimise(
+            problem, torch.zeros_like(problem.scale), tolerance, cap, limit
+        )
+        return array(found.y), array(found.error), array(found.iterations)
 
     def solved_by_kernels(
         self, tolerance: float = 1e-12, limit: int = 5000, dtype=np.float64, applied_force=None

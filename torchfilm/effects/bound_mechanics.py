@@ -16,7 +16,6 @@ from torchfilm.effects.mechanics_report import MechanicsReport
 from torchfilm.kernels.scheme import MARGIN
 from torchfilm.physics import capsule, compiled, torch_step
 from torchfilm.physics.adhesion import Bonds, holds_of, levels_of, most_of_limits
-from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.contacts import Capsules
 from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.problem import TOO_LONG, TOO_STICKY
@@ -52,7 +51,10 @@ class BoundMechanics(BoundEffect):
 
     def __init__(self, effect: Mechanics, binding: Binding):
         super().__init__(effect, binding)
-        self.settings: OneSidedSettings | ContactSettings = effect.settings
+        self.compiled = effect.backend_on(binding.batch.device) == "compiled"
+        self.settings = effect.settings
+        if isinstance(self.settings, OneSidedSettings):
+            self.settings = replace(self.settings, compiled=self.compiled)
         self._check_precision()
         # A surface is made in each step, so that a gradient to a wall's place passes through each
         # of several backward passes.
@@ -61,7 +63,6 @@ class BoundMechanics(BoundEffect):
             "stiffness" if w.stiffness is not None else "weight" if w.weight is not None else "hard"
             for w in self.walls
         ]
-        self.compiled = effect.backend_on(binding.batch.device) == "compiled"
         surfaces = [s for wall in self.walls for s in wall.surfaces(effect.dim)]
         self.holds = holds_of(effect.adhesion, self.walls, effect.dim)
         entries = [tensor for surface in surfaces for tensor in _tensors(surface)]

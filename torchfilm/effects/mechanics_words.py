@@ -76,7 +76,8 @@ def _of_one_sided(
 
 def _who(effect: Mechanics, device: torch.device) -> str:
     who = effect.backend_on(device)
-    return f"{who}; by torch where gradients are required" if who == "compiled" else who
+    by = "assembled by torch" if effect.one_sided else "by torch"
+    return f"{who}; {by} where gradients are required" if who == "compiled" else who
 
 
 def _of_bilateral(

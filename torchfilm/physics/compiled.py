@@ -65,7 +65,7 @@ def step(
             of_rows = length.dtype.type, len(degrees)
             _call_by_teams(step_colonies, of_rows, every, counts, arguments)
         else:
-            _call(step_colonies, every, counts, arguments)
+            share_among_threads(step_colonies, every, counts, arguments)
     _called.add(kind)
     residual = torch.from_numpy(reports[:, kernels.ERROR].copy())
     reports[:, kernels.ERROR] = 0  # may be no number; the others are integers
@@ -127,7 +127,7 @@ def _kernel_of(settings: OneSidedSettings | ContactSettings):
     return step_colonies, np.array(numbers, dtype=np.float64)
 
 
-def _call(kernel, which: np.ndarray, counts: np.ndarray, arguments: tuple) -> None:
+def share_among_threads(kernel, which: np.ndarray, counts: np.ndarray, arguments: tuple) -> None:
     """Call the kernel for the colonies `which`, shared among threads, of which this is one."""
     from torchfilm.kernels.memory import kept
 
@@ -150,20 +150,21 @@ def _call(kernel, which: np.ndarray, counts: np.ndarray, arguments: tuple) -> No
 def _call_by_teams(
     kernel, kind: tuple[type, int], which: np.ndarray, counts: np.ndarray, arguments: tuple
 ) -> None:
-    """As `_call`, for a kernel that a team can run. A colony so large that as many others would
-    leave threads of its team idle comes first, by a team. kind: type of numbers, columns."""
+    """As `share_among_threads`, for a kernel that a team can run. A colony so large that as many
+    others would leave threads of its team idle comes first, by a team. kind: type of numbers,
+    columns."""
     from torchfilm.kernels.team import AVAILABLE
 
     by_one_thread = partial(kernel, np.zeros(0, np.int64))
     if not AVAILABLE or counts.max(initial=0) < 2 * CELLS_A_THREAD:
-        _call(by_one_thread, which, counts, arguments)
+        share_among_threads(by_one_thread, which, counts, arguments)
         return
     teams = np.minimum(counts // CELLS_A_THREAD, available())
     large = (teams > 1) & (counts * teams > counts.sum())
     for colony in which[large]:
         _call_by_team(kernel, int(teams[colony]), colony, kind, arguments)
     if not large.all():
-        _call(by_one_thread, which[~large], counts, arguments)
+        share_among_threads(by_one_thread, which[~large], counts, arguments)
 
 
 def _call_by_team(

@@ -27,7 +27,7 @@ from torchfilm.kernels.scheme import (
     TOO_DEEP,
     UNMOVED,
 )
-from torchfilm.physics import capsule
+from torchfilm.physics import capsule, compiled_solve
 from torchfilm.physics.adhesion import roots_of, wall_roots_of, with_bonds, with_wall_bonds
 from torchfilm.physics.adjoint import attach_gradient
 from torchfilm.physics.contacts import CandidateContacts, Capsules
@@ -262,8 +262,7 @@ class _OneStep:
         hardness, softer = at.hardness, torch.ones_like(at.hardness)
         follows = first_pass and given.alpha is None
         spent, fell = torch.zeros_like(at.iterations), torch.zeros_like(active)
-        again, rising, kept_alpha = active, torch.ones_like(active), hardness
-        goes_on = True
+        again, rising, kept_alpha, goes_on = active, torch.ones_like(active), hardness, 1
         end: Minimum | None = None
         kept: Minimum | None = None
         while True:
@@ -280,10 +279,9 @@ class _OneStep:
                 going_on = (~rising).index_select(0, part.colonies.owner).unsqueeze(1)
                 start = torch.where(going_on, end.y, start)
             with torch.no_grad():
-                found = minimise(
-                    part.detached(), start, settings.tolerance,
-                    2 * self.target, settings.max_iterations,
-                )  # fmt: skip
+                solve = compiled_solve.minimise if settings.compiled else minimise
+                limits = settings.tolerance, 2 * self.target, settings.max_iterations
+                found = solve(part.detached(), start, *limits)
                 end = found if end is None else found.where(again, end, part)
                 spent = spent + torch.where(again, end.iterations, 0)
                 failed = again & (end.error > settings.tolerance) & (end.error < torch.inf)
@@ -299,7 +297,10 @@ class _OneStep:
                 kept = end if kept is None else end.where(down | lags, kept, part)
             was, used = kept_alpha, hardness * softer
             kept_alpha = torch.where(down | lags, used, kept_alpha)
-            goes_on, some_lag = map(bool, numbers((up | down | lags).any(), lags.any()))
+            again = up | down | lags
+            goes_on, some_lag, falls_back = numbers(again.any(), lags.any(), falls.any())
+            if not (goes_on or falls_back):
+                return _Solved(part, end, used, spent, fell)
             if follows and some_lag:
                 y = self._with_gradient(part, end)
                 after = part.gap_after(y) if y.requires_grad else end.after
@@ -308,16 +309,18 @@ class _OneStep:
             hardness = torch.where(falls, was, hardness)
             factor = torch.where(up, SOFTER, torch.where(down, 1.0 / SOFTER, 1.0))
             softer = torch.where(falls, 1.0, softer * factor)
-            rising, again = rising & ~(down | lags), up | down | lags
+            rising = rising & ~(down | lags)
 
     def _with_gradient(self, part: ContactProblem, end: Minimum) -> Tensor:
         """The minimum, as a function of what a gradient is required of."""
         if not (torch.is_grad_enabled() and part.tracked):
             return end.y
-        settings = self.given.settings
+        settings, ids = self.given.settings, self.given.ids
         warn_if_loose(settings.tolerance)
         tolerance = torch.full_like(end.error, settings.tolerance).to(end.y.dtype)
-        return attach_gradient(part, end, tolerance, settings.max_iterations, self.given.ids)
+        return attach_gradient(
+            part, end, tolerance, settings.max_iterations, ids, settings.compiled
+        )
 
     def _problem(self, at, contacts, walls, hardness, softer, least, first_pass) -> ContactProblem:
         """The linear problem of one pass: α by colony, or the given one times `softer`, (B,)."""
@@ -354,10 +357,9 @@ class _OneStep:
         return ContactProblem(rows, gap, applied, alphas, low, scale, rigid, self.groups)
 
     def _followed(self, hardness: Tensor, problem, after: Tensor, contacts, walls) -> Tensor:
-        """α of each colony at which the mean overlap of its contacts, with cells and with hard
-        walls, is the target, and that of the eighth powers at most a share of what is too deep:
-        harder at once, softer by a factor of two a step. Rows at the ends of stretches do not
-        count."""
+        """α of each colony at which the mean overlap of its contacts, with cells and hard walls, is
+        the target, and that of the eighth powers at most a share of what is too deep: harder at
+        once, softer by a factor of two a step. Rows at the ends of stretches do not count."""
         root, soft = self._wall_roots(walls, torch.ones_like(self.given.radius))
         hard = torch.cat([~contacts.beside, ~soft & (root >= 1)])  # all: the first pass moves all
         overlap = torch.where(hard, -after, 0.0).clamp(min=0.0).double()
@@ -429,8 +431,7 @@ class _OneStep:
 
 @dataclass(frozen=True)
 class _Solved:
-    """A solve of a pass: its problem, minimum, α by colony (B,), all iterations (B,), and where
-    only softer contacts converged, (B,) bool."""
+    """A solve of a pass; by colony α, all iterations, and where only softer contacts converged."""
 
     problem: ContactProblem
     end: Minimum

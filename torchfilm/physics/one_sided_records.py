@@ -14,7 +14,8 @@ class OneSidedSettings:
     dim: 2 or 3. soft: cells have a physical stiffness: one pass. passes: at most this many a step.
     overlap: µm, deeper cells are solved again; None: TOO_DEEP radii. contact_overlap: mean overlap
     that contacts leave, radii. tolerance: relative error of the contact forces. max_iterations: of
-    CG a solve. space: where cells are, if it is periodic.
+    CG a solve. space: where cells are, if it is periodic. compiled: kernels solve what torch
+    assembles, on the CPU.
     """
 
     dim: int
@@ -25,6 +26,7 @@ class OneSidedSettings:
     tolerance: float
     max_iterations: int
     space: PeriodicSpace | None = None
+    compiled: bool = False
 
     @property
     def degrees(self) -> int:

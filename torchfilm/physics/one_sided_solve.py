@@ -38,15 +38,13 @@ class Minimum:
     """The end of a minimisation.
 
     y (N, D) the scaled move. after (R,) the gaps after it. active (R,) 1 for rows that push. free
-    (N, D) 1 where no bound holds. inverse (N, D, D) of the blocks of the rows that push. error
-    (B,): see `minimise`. iterations (B,) of CG.
+    (N, D) 1 where no bound holds. error (B,): see `minimise`. iterations (B,) of CG.
     """
 
     y: Tensor
     after: Tensor
     active: Tensor
     free: Tensor
-    inverse: Tensor
     error: Tensor
     iterations: Tensor
 
@@ -57,7 +55,7 @@ class Minimum:
             "of rows": colonies.index_select(0, problem.of_rows.owner),
             "of colonies": colonies,
         }
-        kinds = ["of cells", "of rows", "of rows", "of cells", "of cells"] + 2 * ["of colonies"]
+        kinds = ["of cells", "of rows", "of rows", "of cells"] + 2 * ["of colonies"]
         both = zip(kinds, vars(self).values(), vars(other).values(), strict=True)
         return Minimum(
             *(torch.where(of[kind].reshape(-1, *[1] * (a.dim() - 1)), a, b) for kind, a, b in both)
@@ -111,8 +109,7 @@ def minimise(
         here, at, going = there, found, left
     free = torch.ones_like(y)
     free[:, -1] = (~at.held & ~problem.rigid).to(y.dtype)
-    inverse, _ = _inverse_blocks(problem, at.active, torch.zeros_like(at.held))
-    return Minimum(here.y, here.after, at.active, free, inverse, at.error, iterations)
+    return Minimum(here.y, here.after, at.active, free, at.error, iterations)
 
 
 @dataclass(frozen=True)
@@ -154,7 +151,7 @@ def _look(problem: ContactProblem, here: _Point, cap: Tensor) -> _Look:
     gradient = problem.gradient(y, after * active)
     at_bound = (y[:, -1] <= problem.lower) & (gradient[:, -1] >= 0)
     alone = alone & ~at_bound
-    inverse, own = _inverse_blocks(problem, active, at_bound | alone)
+    inverse, own = inverse_blocks(problem, active, at_bound | alone)
     z = Blocks(inverse).times(gradient)
     limits = cap.index_select(0, rows.owner).square()
     squares = torch.minimum((after * active).square().double(), limits)
@@ -171,7 +168,7 @@ def _look(problem: ContactProblem, here: _Point, cap: Tensor) -> _Look:
     return _Look(active, at_bound | alone, gradient, inverse, downhill, residual, error)
 
 
-def _inverse_blocks(problem: ContactProblem, active: Tensor, held: Tensor) -> tuple[Tensor, Tensor]:
+def inverse_blocks(problem: ContactProblem, active: Tensor, held: Tensor) -> tuple[Tensor, Tensor]:
     """The inverse of each cell's own block of the system, (N, D, D), without its last row and
     column where the length is held, (N,) bool; and the diagonal of the lengths, (N,)."""
     blocks = problem.rows.blocks(active).double()
