@@ -114,10 +114,13 @@ def growing(draw: Draw) -> list[tf.Effect]:
         out = [tf.Growth(rate=tf.Uniform(rate / 3, rate) if g.varied and rate else rate, law=g.law)]
     if g.criterion is None:
         return out
-    longest = max(2 * r, draw.capsules.lengths[1])
-    least = {"length": longest, "volume": math.pi * r * r * (longest + 4 / 3 * r), "added": 3 * r}[
-        g.criterion
-    ]
+    needed = 2 * r * (1 / min(g.fraction, 1 - g.fraction) - 1)  # for daughters of no length
+    longest = max(needed, draw.capsules.lengths[1])
+    least = {
+        "length": longest,
+        "volume": math.pi * r * r * (longest + 4 / 3 * r),
+        "added": max(3 * r, needed),
+    }[g.criterion]
     return [
         *out,
         tf.Division(

@@ -85,7 +85,7 @@ ONE_EFFECT = [
     for names in (
         "circuit bound_circuit circuit_cells circuit_checks circuit_kernels circuit_report"
         " circuit_sbml circuit_words",
-        "division compiled_division",
+        "division compiled_division division_lengths",
         "medium bound_medium medium_transport signal",
         "rules bound_rules bound_division_rule",
         "mechanics bound_mechanics mechanics_report mechanics_words",

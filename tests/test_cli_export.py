@@ -56,6 +56,9 @@ def test_every_format(run, tmp_path, capsys):
         assert len(polydata(tmp_path / "a.vtkhdf", 0)["Polygons"]) == 60 * count
         assert export("a.nwk", colonies=[1]) == ["a.nwk"]
         assert (tmp_path / "a.nwk").read_text() == tree.to_newick(1)
+        assert export("a.lineage.csv") == ["a.lineage.csv"]
+        header, *rows = (tmp_path / "a.lineage.csv").read_text().splitlines()
+        assert header.endswith("fate,birth_length,end_length") and len(rows) == len(tree)
         assert export("a.graphml") == ["a.graphml"]
         graph = networkx.read_graphml(tmp_path / "a.graphml")
         assert len(graph) == len(tree)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+import h5py
 import numpy as np
 import pytest
 from helpers import step
@@ -48,6 +49,51 @@ def test_lineage_is_consistent(whole):
         assert sorted(np.array(keys)[alive].tolist()) == sorted(
             [list(k) for k in zip(state.colony.tolist(), state.uid.tolist(), strict=True)]
         )
+
+
+def test_each_cell_has_its_length_at_birth_and_at_its_end(whole):
+    """Daughters have their parent's length less two caps; a cell that left had what its last state
+    says, and one that lives has no end."""
+    path, states = whole
+    with tf.Results(path) as results:
+        tree = results.lineage()
+    row = {key: k for k, key in enumerate(keys_of(tree))}
+    daughters = {}
+    for k, (colony, parent) in enumerate(zip(tree.colony, tree.parent, strict=True)):
+        if parent >= 0:
+            daughters.setdefault(row[colony, parent], []).append(tree.birth_length[k])
+    assert len(daughters) > 20
+    for k, lengths in daughters.items():
+        assert sum(lengths) == pytest.approx(tree.end_length[k] - 1.0, rel=1e-6)
+        assert tree.end_length[k] > tree.birth_length[k] > 0
+    assert (np.isnan(tree.end_length) == (tree.fate == "alive")).all()
+    first, last = {}, {}
+    for state in states:
+        names = zip(state.colony.tolist(), state.uid.tolist(), strict=True)
+        for name, length in zip(names, state.length.tolist(), strict=True):
+            first.setdefault(name, length)
+            last[name] = length
+    assert [first[name] for name in row] == tree.birth_length.tolist()
+    removed = [name for name, k in row.items() if tree.fate[k] == "removed"]
+    assert removed and all(last[name] == tree.end_length[row[name]] for name in removed)
+    table = tree.to_pandas()
+    assert list(table.columns[-2:]) == ["birth_length", "end_length"] and len(table) == len(tree)
+
+
+def test_a_file_of_an_earlier_version_has_no_lengths_and_goes_on(tmp_path):
+    path, scene = tmp_path / "old.h5", make_scene()
+    record(scene, scene.bind(2, seed=3).start(), path, until=1.0)
+    with h5py.File(path, "r+") as file:
+        del file["lineage/births/length"], file["lineage/ends/length"]
+        file.attrs["version"] = 2
+    with tf.Results(path) as results:
+        state = results.state(scene)
+    recorder = tf.Recorder(path, scene, append=True)
+    *_, state = tf.simulate(scene, state, until=2.0, record=recorder)
+    with tf.Results(path) as results:
+        tree = results.lineage()
+    assert len(tree) > state.cells and np.isnan(tree.birth_length[tree.parent >= 0]).all()
+    assert np.isnan(tree.end_length).all()
 
 
 def test_ancestors_and_descendants(whole):

@@ -339,7 +339,8 @@ class Replay(metaclass=checks.KnownKeywords):
         first, second = firsts.index_select(0, at) + start, seconds.index_select(0, at) + start
         daughters = torch.cat([first, second])
         parents = source.index_select(0, first)
-        births = Births(first, second, state.uid.index_select(0, daughters), old, parents)
+        uid, length = (x.index_select(0, daughters) for x in (state.uid, state.length))
+        births = Births(first, second, uid, length, old, parents)
         state = state.replace(births=(*state.births, births))
         # as where cells divide: what starts again does so from the parents' values of all that does
         return state.reset_at_division(daughters, self.own).with_fields(**taken)

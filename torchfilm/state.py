@@ -69,12 +69,13 @@ class Field(metaclass=checks.KnownKeywords):
 
 @dataclass(frozen=True)
 class Births:
-    """Divisions of one step: rows (M,) of both daughters in the state right after, their uids
-    (2M,), first daughters first, and the state before, with the rows (M,) of the parents in it."""
+    """Divisions of one step: rows (M,) of both daughters in the state right after, uids and lengths
+    (2M,) of first, then second ones, and the state before, with the rows (M,) of the parents."""
 
     first: Tensor
     second: Tensor
     uid: Tensor
+    length: Tensor
     before: State
     rows: Tensor
 
@@ -86,11 +87,12 @@ class Births:
 
 @dataclass(frozen=True)
 class Ended:
-    """Cells that left in one step: colony ids and uids (M,) int64, and why, of `FATES`."""
+    """Cells that left in one step: why, of `FATES`; and colony ids, uids and lengths (M,)."""
 
+    fate: str
     colony_id: Tensor
     uid: Tensor
-    fate: str
+    length: Tensor
 
 
 MAPPINGS = ("fields", "declared", "reports")  # parts that are kept as views that cannot change
@@ -98,8 +100,7 @@ MAPPINGS = ("fields", "declared", "reports")  # parts that are kept as views tha
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Cells of B colonies, N in all, those of one colony side by side. Frozen: a step returns a new
-    one.
+    """Cells of B colonies, N in all, those of one colony side by side. A step returns a new one.
 
     colony (N,) int64, place of its colony in this batch · uid, parent (N,) int64, unique within a
     colony, founders have parent −1 · position (N, d) µm, always float64, so that a colony far from
@@ -145,7 +146,6 @@ class State:
         raise row_checks.no_such_part(name, PER_CELL, self._own_fields(), known)
 
     def __dir__(self) -> list[str]:
-        """With the fields, so that names are completed."""
         return [*super().__dir__(), *(n for n in self._own_fields() if n.isidentifier())]
 
     @property
@@ -338,7 +338,7 @@ class State:
         if not bool(gone.any()):
             return self
         lost, kept = torch.nonzero(gone).squeeze(1), torch.nonzero(~gone).squeeze(1)
-        note = Ended(self.own_colony_id.index_select(0, lost), self.uid.index_select(0, lost), fate)
+        note = Ended(fate, *(x[lost] for x in (self.own_colony_id, self.uid, self.length)))
         return self.take(kept).replace(ended=(*self.ended, note))
 
     def select(self, colonies: Tensor | list[int]) -> State:

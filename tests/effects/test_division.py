@@ -76,7 +76,7 @@ def test_drawn_thresholds_are_drawn_anew_for_each_daughter(criterion):
 
 
 def test_birth_length_of_the_adder_is_the_daughters_own():
-    scene = tf.Scene(tf.Division(added=1.0, fraction=0.25), founders=row_of_cells(1, 3.0))
+    scene = tf.Scene(tf.Division(added=1.0, fraction=0.375), founders=row_of_cells(1, 3.0))
     state = step(scene, flagged(scene), 0.1)
     assert torch.equal(state.birth_length, state.length)
     assert state.birth_length.tolist() == [0.5, 1.5]
@@ -102,8 +102,10 @@ def test_daughters_lengths_and_outer_ends(dim, fraction, device, dtype):
     before = flagged(scene, device=device, dtype=dtype)
     after = step(scene, before, 0.1)
     eps = torch.finfo(dtype).eps
-    wanted = torch.tensor([2 * fraction, 2 * (1 - fraction)] * 5, dtype=dtype, device=device)
-    assert torch.allclose(after.length, wanted, rtol=4 * eps, atol=0)
+    # of the 4 µm with caps; each daughter has caps of 1 µm
+    wanted = [4 * fraction - 1, 4 * (1 - fraction) - 1] * 5
+    wanted = torch.tensor(wanted, dtype=dtype, device=device)
+    assert torch.allclose(after.length, wanted, rtol=0, atol=8 * eps)
     assert torch.equal(after.axis, before.axis.repeat_interleave(2, 0))
     low, high = (torch.as_tensor(e) for e in ends(before))
     out = before.radius.double().cpu()[:, None] * before.axis.double().cpu()
@@ -120,9 +122,9 @@ def test_daughters_lengths_and_outer_ends(dim, fraction, device, dtype):
 
 
 def test_fraction_for_each_colony():
-    scene = tf.Scene(tf.Division(fraction=[0.2, 0.5]), founders=row_of_cells(1, 3.0))
+    scene = tf.Scene(tf.Division(fraction=[0.3, 0.5]), founders=row_of_cells(1, 3.0))
     assert step(scene, flagged(scene, 2), 0.1).length.tolist() == pytest.approx(
-        [0.4, 1.6, 1.0, 1.0], rel=1e-12
+        [0.2, 1.8, 1.0, 1.0], rel=1e-12
     )
 
 
@@ -132,7 +134,7 @@ def test_drawn_fractions():
     )
     first, second = step(scene, flagged(scene, 500), 0.1).length.reshape(500, 2).T
     assert torch.allclose(first + second, torch.full_like(first, 2.0), rtol=1e-14, atol=0)
-    share = first / 2
+    share = (first + 1) / 4
     assert ((share > 0.3) & (share < 0.7)).all()
     assert float(share.mean()) == pytest.approx(0.5, abs=4 * 0.4 / math.sqrt(12 * 500))
     assert float(share.std()) == pytest.approx(0.4 / math.sqrt(12), rel=0.12)
@@ -321,14 +323,14 @@ def test_4096_divisions_at_once(device, dtype):
 
 
 def test_gradient_passes_through_the_copying():
-    """Daughters' lengths are (l − 1)f and (l − 1)(1 − f); the sum of l² then has slope 2 l₁ f + 2
-    l₂ (1 − f)."""
+    """Daughters' lengths are (l + 1)f − 1 and (l + 1)(1 − f) − 1; the sum of l² then has slope
+    2 l₁ f + 2 l₂ (1 − f)."""
     scene = tf.Scene(tf.Division(fraction=0.3, axis_noise=0.0), founders=row_of_cells(1, 3.0))
     state = flagged(scene)
     length = state.length.clone().requires_grad_()
     after = step(scene, state.replace(length=length), 0.1)
     (slope,) = torch.autograd.grad((after.length**2).sum(), length)
-    assert float(slope) == pytest.approx(2 * 0.6 * 0.3 + 2 * 1.4 * 0.7, rel=1e-12)
+    assert float(slope) == pytest.approx(2 * 0.2 * 0.3 + 2 * 1.8 * 0.7, rel=1e-12)
     (shift,) = torch.autograd.grad(
         step(scene, state.replace(length=length), 0.1).position[0, 0], length
     )
@@ -338,7 +340,8 @@ def test_gradient_passes_through_the_copying():
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("axis_noise", [0.0, 0.01, [0.0, 0.1, 0.2, 0.3]])
-def test_cells_divide_alike_by_kernels_and_by_torch(dim, axis_noise, dtype, monkeypatch):
+@pytest.mark.parametrize("caps", [2.0, 4 / 3])
+def test_cells_divide_alike_by_kernels_and_by_torch(dim, axis_noise, caps, dtype, monkeypatch):
     """Colonies in which none, some and all cells are due, and one without cells: the same bits,
     since it must not matter whether numba has been loaded."""
     pytest.importorskip("numba")
@@ -356,13 +359,14 @@ def test_cells_divide_alike_by_kernels_and_by_torch(dim, axis_noise, dtype, monk
     due = torch.tensor([0, 0, 0, 1, 0, 1, 1, 0, 1, 1, 1, 1], dtype=torch.bool)
     bound = next(e for e in model.effects if e.title == "division")
     (rows,), fresh = torch.nonzero(due, as_tuple=True), bound._fresh(state)
-    given = bound.values.fraction, bound.values.axis_noise, fresh
+    share = bound.values.fraction.of_rows(state, rows, "Division.fraction")
+    given = share, bound.values.axis_noise, fresh, caps
     by_kernels = division.divide(state, rows, *given)
     monkeypatch.setattr(compiled_division, "kernels_loaded", lambda value: False)
     by_torch = division.divide(state, rows, *given)
     assert by_kernels.births[-1].rows.tolist() == [3, 5, 6, 8, 9, 10, 11]
     assert_same_state(by_kernels, by_torch)
-    for name in ("first", "second", "uid", "rows"):
+    for name in ("first", "second", "uid", "length", "rows"):
         assert torch.equal(*(getattr(s.births[-1], name) for s in (by_kernels, by_torch)))
 
 

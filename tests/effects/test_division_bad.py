@@ -68,6 +68,50 @@ def test_length_threshold_that_leaves_no_room_for_caps_is_refused(threshold):
 
 
 @pytest.mark.parametrize(
+    "threshold, fraction, words",
+    [
+        # f (l + 1) ≥ 1 µm, what the caps of a daughter take
+        ({"length": 3.9}, 0.2, r"length can be 3\.9: it must be at least 4 .*fraction of 0\.2"),
+        ({"length": 3.9}, tf.Uniform(0.3, 0.8), "fraction of 0.2.*nearer to 0.5"),
+        ({"length": 4.1}, 0.2, None),
+        # f (l + 2/3) ≥ 2/3
+        ({"length": 2.6, "conserves": "volume"}, 0.2, r"at least 2\.66667 "),
+        ({"length": 2.7, "conserves": "volume"}, 0.2, None),
+        ({"volume": 3.6}, 0.2, r"volume can be 3\.6: it must be at least 3\.66519 "),
+    ],
+)
+def test_a_threshold_too_low_for_the_shorter_daughter_is_refused(threshold, fraction, words):
+    division = tf.Division(fraction=fraction, **threshold)
+    scene = tf.Scene(division, founders=row_of_cells(1))
+    if words is None:
+        scene.bind().start()
+    else:
+        with pytest.raises(tf.InputError, match=words):
+            scene.bind().start()
+
+
+@pytest.mark.parametrize("by_torch", [False, True])
+@pytest.mark.parametrize("fraction", [0.2, [0.2, 0.5, 0.4], tf.Uniform(0.2, 0.2001)])
+def test_a_cell_too_short_for_its_shorter_daughter_fails_its_colony(
+    fraction, by_torch, monkeypatch
+):
+    """Of cells of 3.9 and 4.1 µm: with a share of a fifth the former would have a daughter of
+    −0.02 µm."""
+    if by_torch:
+        monkeypatch.setattr("torchfilm.effects.division.knows_due", lambda *_: False)
+    scene = tf.Scene(tf.Division(fraction=fraction), founders=row_of_cells(1, 3.9))
+    state = flagged(scene, 3)
+    state = state.replace(length=torch.tensor([3.9, 4.1, 3.9], dtype=state.dtype))
+    after = step(scene, state, 0.1)
+    report = after.reports["division"]
+    third = fraction == [0.2, 0.5, 0.4]
+    assert report.status.tolist() == [1, 0, 0 if third else 1]
+    assert after.counts.tolist() == [1, 2, 2 if third else 1]
+    assert float(report.needs[0]) == pytest.approx(4.0, abs=2e-3)
+    assert report.reason(0).startswith("cell 0 is due to divide at length 3.9 µm, but needs at")
+
+
+@pytest.mark.parametrize(
     "length, radius, threshold, words",
     [
         # the largest number of any type is not what a cell of type 0 may reach

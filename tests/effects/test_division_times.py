@@ -119,7 +119,7 @@ def test_a_variable_of_a_rule_may_be_called_like_the_threshold():
 
 
 def test_a_daughter_that_is_born_beyond_its_threshold_divides_in_the_next_step():
-    division = tf.Division(length=tf.Uniform(2.2, 6.0), fraction=0.8)
+    division = tf.Division(length=tf.Uniform(4.2, 12.0), fraction=0.8)
     scene = tf.Scene(tf.Growth(rate=1.0), division, dim=2, dt=0.05)
     waited = 0
     state = scene.bind(4).start()

@@ -31,8 +31,8 @@ def divided(dim: int, fraction: float, by_torch: bool, monkeypatch, **given):
 def test_daughters_have_the_volume_and_touch(dim, fraction, by_torch, monkeypatch):
     parent, two = divided(dim, fraction, by_torch, monkeypatch, conserves="volume")
     assert float(two.volume.sum()) == pytest.approx(float(parent.volume[0]), rel=1e-14)
+    assert float(two.volume[0] / parent.volume[0]) == pytest.approx(fraction, rel=1e-13)
     first, second = two.length.tolist()
-    assert first / (first + second) == pytest.approx(fraction, rel=1e-13)
     # touching: their centres are half of each centreline and two radii apart
     apart = float((two.position[1] - two.position[0]).norm())
     assert apart == pytest.approx(0.5 * (first + second) + 0.8, rel=1e-13)

@@ -17,14 +17,16 @@ from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 
 TABLE, NEWICK, GRAPH, VTK = ".csv", ".nwk", ".graphml", ".vtkhdf"
+LIVES = ".lineage.csv"
 IMAGES = (".tif", ".tiff")
-SUFFIXES = (TABLE, NEWICK, GRAPH, VTK, *IMAGES)
+SUFFIXES = (TABLE, LIVES, NEWICK, GRAPH, VTK, *IMAGES)
 FOLDER = ""  # ground truth for segmentation and tracking is a folder, which has no suffix
 # Options of each format, beside --overwrite.
 PAGES = ("frames", "colonies", "pixel_size", "window")
 LIGHT = ("channels", "blur", "noise", "background", "offset", "profile", "seed")
 OPTIONS: dict[str, tuple[str, ...]] = {
     TABLE: ("frames", "internals"),
+    LIVES: (),
     NEWICK: ("colonies",),
     GRAPH: ("colonies",),
     VTK: ("frames", "colonies", "rods"),
@@ -37,21 +39,23 @@ OPTIONS: dict[str, tuple[str, ...]] = {
 @dataclass
 class Export:
     """Write results for other programs. The suffix of the new file says the format: .csv, the
-    table of cells; .vtkhdf, for ParaView and pyvista; .tif or .ome.tif, label masks, or
-    fluorescence where --channels are given; .nwk, the lineage in Newick format; .graphml, the
-    lineage as a graph. A name without a dot, such as ctc/, is a folder in the format of the Cell
-    Tracking Challenge: images, label masks and tracks."""
+    table of cells, frame by frame; .lineage.csv, one row per cell: when it was born and ended, how
+    long it was then, and its fate; .vtkhdf, for ParaView and pyvista; .tif or .ome.tif, label
+    masks, or fluorescence where --channels are given; .nwk, the lineage in Newick format; .graphml,
+    the lineage as a graph. A name without a dot, such as ctc/, is a folder in the format of the
+    Cell Tracking Challenge: images, label masks and tracks."""
 
     file: Annotated[Path, tyro.conf.Positional]
     """Results file."""
     out: Annotated[Path, tyro.conf.Positional]
-    """The new file: NAME.csv, .vtkhdf, .tif, .ome.tif, .nwk or .graphml; or the new folder."""
+    """The new file: NAME.csv, .lineage.csv, .vtkhdf, .tif, .ome.tif, .nwk or .graphml; or the new
+    folder."""
     frames: list[str] = field(default_factory=list)
     """Which frames, such as --frames 0 10 -1, or ranges START:STOP or START:STOP:STEP as in Python,
-    such as --frames 2:5 or --frames=-3:; by default all. (Not .nwk, .graphml.)"""
+    such as --frames 2:5 or --frames=-3:; by default all. (Not .lineage.csv, .nwk, .graphml.)"""
     colonies: list[int] = field(default_factory=list)
     """Which colonies, by their ids; by default all. Images need one, if the run has several; .nwk
-    and .graphml take one or all. (Not .csv.)"""
+    and .graphml take one or all. (Not .csv, .lineage.csv.)"""
     pixel_size: float | None = None
     """Images: width of a pixel, µm."""
     window: list[float] = field(default_factory=list)
@@ -88,12 +92,13 @@ class Export:
         if suffix not in (*SUFFIXES, FOLDER):
             rule = f"a name that ends in {', '.join(SUFFIXES)}, or that of a folder, without a dot"
             raise checks.input_error("OUT", str(self.out), rule)
-        form = suffix
+        form = LIVES if self.out.name.lower().endswith(LIVES) else suffix
         if suffix in IMAGES:
             form = "fluorescence" if self.channels else "label masks"
         self._check_options(form)
         writers: dict[str, Callable[[Results], Any]] = {
             TABLE: self._table,
+            LIVES: self._lives,
             NEWICK: self._newick,
             GRAPH: self._graph,
             VTK: self._vtk,
@@ -154,6 +159,12 @@ class Export:
                 mode = "w" if number == 0 else "a"
                 table = data_frame(tables([k]))
                 table.to_csv(beside, mode=mode, header=number == 0, index=False)
+        return [path]
+
+    def _lives(self, results: Results) -> list[Path]:
+        path, table = self._new(results, TABLE), results.lineage().to_pandas()
+        with written_whole(path) as beside:
+            table.to_csv(beside, index=False)
         return [path]
 
     def _newick(self, results: Results) -> list[Path]:
@@ -245,5 +256,7 @@ def _gain(text: str) -> tuple[str, float]:
 
 
 def _content(form: str) -> str:
-    known = {TABLE: "the table", NEWICK: "the lineage", GRAPH: "the lineage", VTK: "shapes"}
+    known = {TABLE: "the table", VTK: "shapes"} | dict.fromkeys(
+        (LIVES, NEWICK, GRAPH), "the lineage"
+    )
     return {**known, FOLDER: "images, label masks and tracks"}.get(form, form)

@@ -39,7 +39,7 @@ class DivisionRule(BoundRule):
             return state
         one = torch.zeros(1, dtype=torch.int64, device=state.device)
         twice = state.take(torch.cat([one, one]))
-        births = Births(one, one + 1, torch.cat([one, one]), state, one)
+        births = Births(one, one + 1, torch.cat([one, one]), twice.length, state, one)
         with own_draws(label_of(divide)):
             views = _after_divide(divide, self, twice, births)
         self.traced_reads = tuple(sorted(_read(views)))

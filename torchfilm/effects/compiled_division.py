@@ -66,9 +66,10 @@ def knows_due(state: State, size: Tensor | None) -> bool:
     return flag and kernels_loaded(state.length) and all(x.dtype == state.dtype for x in given)
 
 
-def due_rows(state: State, size: Tensor | None) -> tuple[Tensor | None, int]:
+def due_rows(state: State, size: Tensor | None, need: float) -> tuple[Tensor | None, int]:
     """The rows (M,) of the cells that divide, None for none, and how many of them are too short:
-    see `kernels.divisions.due_rows`. size: (N,), or None where there is no threshold."""
+    see `kernels.divisions.due_rows`. size: (N,), or None where there is no threshold. need: length
+    that a cell needs, radii."""
     from torchfilm.kernels import divisions
 
     fields = state.fields
@@ -76,7 +77,8 @@ def due_rows(state: State, size: Tensor | None) -> tuple[Tensor | None, int]:
     real = lambda x: as_array(x, state.dtype)
     criterion = (none, none) if size is None else (real(size), real(fields["division_threshold"]))
     flag = as_array(fields["divide_flag"], torch.bool)
-    rows, short = divisions.due_rows(flag, *criterion, real(state.length), real(state.radius))
+    of_cells = real(state.length), real(state.radius)
+    rows, short = divisions.due_rows(flag, *criterion, *of_cells, in_numpy(state.dtype)(need))
     return (torch.from_numpy(rows) if len(rows) else None), short
 
 
@@ -86,12 +88,12 @@ def divided(
     share: Tensor,
     noise: Tensor,
     fresh: Mapping[str, float | Drawn],
-    lost: float,
+    caps: float,
 ) -> tuple[State, Tensor]:
     """The state in which the cells `rows` (M,) are divided, and the rows of their daughters (2 M,),
-    first daughters first. share: (M,) or (), of the length. noise: (M,) or (), of the axes. fresh:
-    with what daughters begin in some of the fields; in the others with what their parents have.
-    lost: of the parent's length, radii."""
+    first daughters first. share: (M,) or (), of what is conserved. noise: (M,) or (), of the axes.
+    fresh: with what daughters begin in some of the fields; in the others with what their parents
+    have. caps: what they hold of it, as radii of length."""
     from torchfilm.kernels import divisions
 
     every = state.cell_columns()
@@ -119,7 +121,7 @@ def divided(
         (array(state.position, torch.float64), real(state.axis), real(state.length),
          real(state.radius)),
         tuple(array(getattr(state, n)) for n in IDS),
-        real(share.reshape(-1)), real(noise.reshape(-1)), lost,
+        real(share.reshape(-1)), real(noise.reshape(-1)), caps,
         np.array(noise_key), np.array(places).reshape(len(new), -1),
         np.array(numbers).reshape(len(new), 2),
     )  # fmt: skip

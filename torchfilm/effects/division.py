@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from torchfilm.effects.compiled_division import (
     known_number,
     knows_due,
 )
+from torchfilm.effects.division_lengths import CAPS, least_length, without_short
 from torchfilm.physics import capsule
 from torchfilm.resolver import Resolved, Values
 from torchfilm.state import CELL, Births, Ended, Field, State
@@ -30,34 +31,8 @@ from torchfilm.tools.vectors import nearest_root
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, physical, smallest
 
 CRITERIA = ("length", "volume", "added")
-LOST = {"length": 2.0, "volume": 4 / 3}  # radii of the parent's length that daughters do not get
-TOO_SHORT = 1
 PIXELS = 10.0  # µm; for a longer first cell, messages say that lengths may be in pixels
 THRESHOLD = "a threshold (such as length=tf.Uniform(3.5, 4.5))"  # what it needs without rules
-
-
-@dataclass(frozen=True)
-class DivisionReport:
-    """Which colonies could not divide, per colony (B,).
-
-    status: 0 or TOO_SHORT. uid, length: the first cell that was due and too short, µm. needs: the
-    length that it needs, µm. The report exists only if there is such a cell; no cell divided in its
-    colony.
-    """
-
-    status: Tensor
-    uid: Tensor
-    length: Tensor
-    needs: Tensor
-
-    hint: ClassVar[str] = "Divide later, or start from longer cells"
-
-    def reason(self, place: int) -> str:
-        """Describes the failure of the colony at this place of the batch."""
-        return (
-            f"cell {int(self.uid[place])} is due to divide at length {float(self.length[place]):g}"
-            f" µm, but needs at least {float(self.needs[place]):g} µm for two new caps"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +46,11 @@ class Division(Effect):
     next one where they are born beyond it; the flag also works beside a threshold. Without a
     threshold, only cells with `divide_flag` divide, right after the rules, before cells grow.
 
-    fraction: share of the length that the first daughter (at the −axis end) gets; a distribution is
-    drawn at each division. axis_noise: standard deviation of the noise on each component of a
-    daughter's axis. conserves: "length", caps included, as the paper does and loses a little volume
-    by it; or "volume": then daughters' outer ends are r/3 farther out than their parent's.
+    conserves: "length", caps included, as the paper does and loses a little volume by it; or
+    "volume": then daughters' outer ends are r/3 farther out than their parent's. fraction: share of
+    that length, or volume, that the first daughter (at the −axis end) gets; a distribution is drawn
+    at each division. axis_noise: standard deviation of the noise on each component of a daughter's
+    axis.
     """
 
     length: Value | None = physical(None, unit="µm", above=0.0, drawn_by_effect=True)
@@ -90,7 +66,7 @@ class Division(Effect):
     may_repeat = False
 
     def __post_init__(self) -> None:
-        checks.choice("Division.conserves", self.conserves, tuple(LOST))
+        checks.choice("Division.conserves", self.conserves, tuple(CAPS))
         given = [name for name in CRITERIA if getattr(self, name) is not None]
         if len(given) > 1:
             raise checks.InputError(
@@ -188,7 +164,8 @@ class Division(Effect):
         if self.criterion == "added":
             return
         # daughters keep the radius, so a cell's own threshold is compared with its own radius
-        needed = 2 * state.radius
+        small = min(smallest(self.fraction), 1.0 - largest(self.fraction))
+        needed = float(least_length(small, CAPS[self.conserves])) * state.radius
         if self.criterion == "volume":
             needed = capsule.volume(needed, state.radius)
         short = torch.nonzero(least < needed * (1 - 1e-6)).squeeze(1)
@@ -196,8 +173,10 @@ class Division(Effect):
             k = int(short[0])
             raise checks.InputError(
                 f"Division.{self.criterion} can be {float(least[k]):g}: it must be at least"
-                f" {float(needed[k]):g} for radius {float(state.radius[k]):g} µm, or the daughters"
-                " would have a negative length (each loses a new cap). Raise the threshold."
+                f" {float(needed[k]):g} for radius {float(state.radius[k]):g} µm"
+                + (f" and a fraction of {small:g}" if small < 0.5 else "")
+                + ", or the daughters would have a negative length (each has two caps). Raise the"
+                " threshold" + (", or take a fraction nearer to 0.5." if small < 0.5 else ".")
             )
 
     def _bounds(self, state: State) -> tuple[Tensor, Tensor]:
@@ -238,7 +217,15 @@ class Division(Effect):
         return flag if size is None else flag | (size >= state.fields["division_threshold"])
 
     def step(self, state: State, dt: float, values: Values) -> State:
-        return _divided_where_due(state, *_due_by_torch(self, state), values, None, self.conserves)
+        due = _due_by_torch(self, state, self.need(values))
+        return _divided_where_due(state, *due, values, None, CAPS[self.conserves])
+
+    def need(self, values: Values) -> Any:
+        """The length that a cell needs to divide, radii: one number, or None where its daughters'
+        shares are its own."""
+        share = self.fraction if isinstance(self.fraction, float) else values.fraction.value
+        alone = share is not None and not getattr(share, "ndim", 0)
+        return least_length(share, CAPS[self.conserves]) if alone else None
 
 
 class _BoundDivision(BoundEffect):
@@ -254,10 +241,14 @@ class _BoundDivision(BoundEffect):
     def step(self, state: State, dt: float) -> State:
         size = self.effect.size(state)
         known = knows_due(state, size)
-        rows, some_short = due_rows(state, size) if known else _due_by_torch(self.effect, state)
+        need = self.effect.need(self.values)
+        if known:
+            rows, some_short = due_rows(state, size, 0.0 if need is None else float(need))
+        else:
+            rows, some_short = _due_by_torch(self.effect, state, need)
         if rows is None:
             return state
-        more = self._fresh(state), self.effect.conserves
+        more = self._fresh(state), CAPS[self.effect.conserves]
         return _divided_where_due(state, rows, some_short, self.values, *more)
 
     def _fresh(self, state: State) -> dict[str, float | Drawn] | None:
@@ -279,11 +270,12 @@ class _BoundDivision(BoundEffect):
         return found
 
 
-def _due_by_torch(division: Division, state: State) -> tuple[Tensor | None, int]:
-    """The rows of the cells that divide, None for none; and whether some are too short."""
+def _due_by_torch(division: Division, state: State, need: Any) -> tuple[Tensor | None, int]:
+    """The rows of the cells that divide, None for none; and whether some are too short, where need
+    (radii) is one number."""
     with torch.no_grad():
         due = division.due(state)
-        short = due & (state.length < 2 * state.radius)
+        short = due & (state.length < (0.0 if need is None else need) * state.radius)
         some_due, some_short = numbers(due.any(), short.any())
         return (rows_where(due)[0] if some_due else None), some_short
 
@@ -294,16 +286,18 @@ def _divided_where_due(
     some_short: int,
     values: Values,
     fresh: Mapping[str, float | Drawn] | None,
-    conserves: str,
+    caps: float,
 ) -> State:
     """The state in which the cells `rows` are divided, but those of colonies in which one is too
-    short. fresh: as `divide` has it. conserves: as `Division` has it."""
-    if rows is not None and some_short:
-        with torch.no_grad():
-            state, rows = _without_short(state, rows)
-    if rows is None or not rows.numel():
+    short: if any is, or where each has a share of its own. fresh, caps: as `divide` has them."""
+    if rows is None:
         return state
-    return divide(state, rows, values.fraction, values.axis_noise, fresh, LOST[conserves])
+    share = _of_rows(values.fraction, state, rows, "Division.fraction")
+    if some_short or share.dim():
+        with torch.no_grad():
+            state, sound = without_short(state, rows, least_length(share, caps))
+        rows, share = rows[sound], share[sound] if share.dim() else share
+    return divide(state, rows, share, values.axis_noise, fresh, caps) if rows.numel() else state
 
 
 def _pixels_hint(length: float, radius: float) -> str:
@@ -316,47 +310,33 @@ def _pixels_hint(length: float, radius: float) -> str:
     )
 
 
-def _without_short(state: State, rows: Tensor) -> tuple[State, Tensor]:
-    """The state that reports those of the cells `rows` (M,) that are too short to divide, and the
-    rows of other colonies."""
-    too_short = (state.length < 2 * state.radius).index_select(0, rows)
-    number = torch.arange(state.cells, 0, -1, device=state.device)
-    marks = torch.zeros_like(number).index_copy(0, rows, torch.where(too_short, number[rows], 0))
-    first = state.cells - state.groups.max(marks)
-    status = torch.where(first < state.cells, TOO_SHORT, 0)
-    row = first.clamp(max=state.cells - 1)
-    pick = lambda x: x.detach().index_select(0, row)
-    report = DivisionReport(status, pick(state.uid), pick(state.length), 2 * pick(state.radius))
-    sound = (status != TOO_SHORT).index_select(0, state.colony.index_select(0, rows))
-    return state.replace(reports={**state.reports, "division": report}), rows[sound]
-
-
 def divide(
     state: State,
     rows: Tensor,
-    fraction: Resolved,
+    share: Tensor,
     axis_noise: Resolved,
     fresh: Mapping[str, float | Drawn] | None,
-    lost: float = 2.0,
+    caps: float,
 ) -> State:
     """Divides the cells `rows` (M,), ascending. The daughters are neighbours in the batch; the
-    first lies at the parent's −axis end. fresh: with what daughters begin in all fields that a
-    division resets, if that is known; kernels then see to it.
+    first lies at the parent's −axis end. share: (M,) or (), of what is conserved, that it gets.
+    fresh: with what daughters begin in all fields that a division resets, if that is known; kernels
+    then see to it.
 
-    Their lengths are (l − lost·r)f and (l − lost·r)(1 − f). They touch, with their middle in that
-    of the parent. Gradients pass through.
+    With c = caps·r, daughters of shares f and 1 − f get f(l + c) − c and (1 − f)(l + c) − c. They
+    touch, with their middle in that of the parent. Gradients pass through.
     """
-    share = _of_rows(fraction, state, rows, "Division.fraction")
     by_kernels = can_divide(state, share, axis_noise)
     if by_kernels:
         noise = _of_rows(axis_noise, state, rows)
-        new, daughters = divided(state, rows, share, noise, fresh or {}, lost)
+        new, daughters = divided(state, rows, share, noise, fresh or {}, caps)
     else:
-        new, daughters = _divided(state, rows, share, axis_noise, lost)
+        new, daughters = _divided(state, rows, share, axis_noise, caps)
     first, second = daughters.chunk(2)
-    births = Births(first, second, new.uid.index_select(0, daughters), state, rows)
+    uid, length = (x.index_select(0, daughters) for x in (new.uid, new.length))
+    births = Births(first, second, uid, length, state, rows)
     colony_id = state.colony_id.index_select(0, state.colony.index_select(0, rows))
-    note = Ended(colony_id, state.uid.index_select(0, rows), "divided")
+    note = Ended("divided", colony_id, state.uid[rows], state.length[rows])
     at = new.position if new.space is None else new.space.inside(new.position)
     new = new.replace(births=(*new.births, births), ended=(*new.ended, note), position=at)
     if by_kernels and fresh is not None:
@@ -371,7 +351,7 @@ def _of_rows(value: Resolved, state: State, rows: Tensor, purpose: str | None = 
 
 
 def _divided(
-    state: State, rows: Tensor, share: Tensor, axis_noise: Resolved, lost: float
+    state: State, rows: Tensor, share: Tensor, axis_noise: Resolved, caps: float
 ) -> tuple[State, Tensor]:
     """As `compiled_division.divided`, by torch, with daughters whose fields are their parents'."""
     due = torch.zeros_like(state.colony).index_fill(0, rows, 1)
@@ -385,10 +365,12 @@ def _divided(
     length, radius, axis = (
         x.index_select(0, rows) for x in (state.length, state.radius, state.axis)
     )
-    rest = length - lost * radius
-    lengths = torch.cat([rest * share, rest * (1 - share)])
+    own = caps * radius
+    rest, more = length - own, (2 * share - 1) * own  # exactly 0 for equal halves
+    lengths = torch.cat([rest * share + more, rest * (1 - share) - more])
+    lengths = lengths.clamp(min=0.0)  # where rounding takes one below
     shift = 0.5 * (lengths - torch.cat([length, length]))
-    shift = shift - (1 - 0.5 * lost) * torch.cat([radius, radius])
+    shift = shift - (1 - 0.5 * caps) * torch.cat([radius, radius])
     shift = torch.cat([shift[: rows.numel()], -shift[rows.numel() :]]).unsqueeze(1)
     axis = torch.cat([axis, axis])
     moved = (shift * axis).to(new.position.dtype)

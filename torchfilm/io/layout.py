@@ -38,7 +38,7 @@ from torch import Tensor
 
 from torchfilm.state import CELL, COLONY, PER_CELL, State
 
-FORMAT, VERSION = "torchfilm results", 2
+FORMAT, VERSION = "torchfilm results", 3
 AT_CELLS = "signals_at_cells"
 # Internal fields of files that do not name theirs, as earlier versions wrote them.
 INTERNAL_BEFORE = (
@@ -54,8 +54,8 @@ CHUNK_ROWS, CHUNK_VOXELS = 512, 32768  # at most so many voxels
 CHUNK_BYTES = 1024  # of the tables that are not compressed
 BLANK = {"f": np.nan, "i": -1}  # between frames, by the kind of dtype
 LINEAGE = {
-    "births": ("colony_id", "uid", "parent", "step"),
-    "ends": ("colony_id", "uid", "step", "fate"),
+    "births": ("colony_id", "uid", "parent", "step", "length"),
+    "ends": ("colony_id", "uid", "step", "fate", "length"),
 }
 # step last: it commits the frame
 FRAME_COLUMNS = ("first_row", "counts", "next_uid", "births", "ends", "time", "step")
@@ -192,4 +192,5 @@ def create_tables(file: h5py.File, state: State) -> None:
             create_table(file, f"frames/grid/{name}", value.dtype, value.shape)
     for table, columns in LINEAGE.items():
         for name in columns:
-            create_table(file, f"lineage/{table}/{name}", np.int64, ())
+            dtype = np.float64 if name == "length" else np.int64
+            create_table(file, f"lineage/{table}/{name}", dtype, ())

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+import h5py
 import numpy as np
 
 from torchfilm.io.layout import LINEAGE
-from torchfilm.io.reading import committed, read_dataset
+from torchfilm.io.reading import blaming_file, committed, read_dataset
 from torchfilm.io.table import Tables, data_frame, needed
 from torchfilm.state import FATES
 from torchfilm.tools import checks
@@ -19,6 +20,19 @@ from torchfilm.tools.checks import InputError
 if TYPE_CHECKING:
     from torchfilm.io.results import Results
 
+COLUMNS = (
+    "colony", "cell", "parent", "founder", "born", "ended", "fate", "birth_length", "end_length",
+)  # fmt: skip
+
+
+def _column(file: h5py.File, name: str, count: int) -> np.ndarray:
+    """The first rows of a table's column; NaN where an older file does not have it."""
+    with blaming_file(file, name):
+        lacks = name.endswith("/length") and bool(file) and name not in file
+    if lacks:
+        return np.full(count, np.nan)
+    return read_dataset(file, name, slice(count))
+
 
 class Lineage:
     """Every cell of a recorded run, as arrays (N,), and as a tree.
@@ -26,8 +40,9 @@ class Lineage:
     colony: id of its colony · cell: its uid, unique within the colony · parent: uid, −1 for
     founders · born: h; the founders' is the start of the run, and that of cells which a run found
     in the middle of another is not known, NaN · ended: h, NaN while it lives · fate: "alive",
-    "divided", "removed", "left", "lysed", "eroded", "sloughed" or "failed" · founder: uid of the
-    first of its line in the file.
+    "divided", "removed", "left", "lysed", "eroded", "sloughed" or "failed" · birth_length,
+    end_length: of the centreline, µm, when it was born and ended; NaN where that hour is NaN, and
+    in files of earlier versions · founder: uid of the first of its line in the file.
 
     Cells are named by uid, and in a run of several colonies by `colony`, an id, too. `course` reads
     the file, which must be open. Raises InputError for cells and colonies that the run does not
@@ -38,7 +53,7 @@ class Lineage:
         self._results = results
         file, size, first = results.file, committed(results.file), results.frame(0)
         births, ends = (
-            {n: read_dataset(file, f"lineage/{t}/{n}", slice(size[t])) for n in LINEAGE[t]}
+            {n: _column(file, f"lineage/{t}/{n}", size[t]) for n in LINEAGE[t]}
             for t in ("births", "ends")
         )
         steps, times = results.steps, results.times
@@ -52,13 +67,20 @@ class Lineage:
         self.parent: np.ndarray = np.concatenate([first["parent"], births["parent"]])
         founded = np.where((first["parent"] < 0) & (steps[0] == 0), times[0], np.nan)
         self.born: np.ndarray = np.concatenate([founded, np.interp(births["step"], steps, times)])
-        self.ended = np.full(len(self.cell), np.nan)
+        lengths = np.where(np.isnan(founded), np.nan, first["length"])
+        self.birth_length: np.ndarray = np.concatenate([lengths, births["length"]])
+        self.ended, self.end_length = (np.full(len(self.cell), np.nan) for _ in range(2))
         self.fate = np.full(len(self.cell), "alive", dtype="<U8")
         self._order = np.argsort(_pair(self.colony, self.cell))
         self._keys = _pair(self.colony, self.cell)[self._order]
         at = self._rows(ends["colony_id"], ends["uid"])
         self.ended[at] = np.interp(ends["step"], steps, times)
+        if not np.isin(ends["fate"], np.arange(len(FATES))).all():
+            raise InputError(
+                f"{self._path} is damaged: it has ends of no known fate. Use another copy of it."
+            )
         self.fate[at] = np.asarray(FATES)[ends["fate"]]
+        self.end_length[at] = ends["length"]
 
     def __len__(self) -> int:
         return len(self.cell)
@@ -69,9 +91,8 @@ class Lineage:
 
     def to_pandas(self) -> Any:
         """A pandas.DataFrame with one row per cell: colony, cell, parent, founder, born, ended,
-        fate."""
-        names = ("colony", "cell", "parent", "founder", "born", "ended", "fate")
-        return data_frame({name: getattr(self, name) for name in names})
+        fate, birth_length, end_length."""
+        return data_frame({name: getattr(self, name) for name in COLUMNS})
 
     def born_of(self, colony: np.ndarray, cell: np.ndarray) -> np.ndarray:
         """When cells (M,) of colonies (M,) were born, h."""

@@ -304,11 +304,13 @@ class Recorder(metaclass=checks.KnownKeywords):
             parents = torch.cat([b.parents.uid, b.parents.uid])
             ids = torch.cat([b.parents.own_colony_id, b.parents.own_colony_id])
             steps = np.full(parents.numel(), state.step)
-            self.births.append((numpy_of(ids), numpy_of(b.uid), numpy_of(parents), steps))
+            own = (numpy_of(x) for x in (ids, b.uid, parents))
+            self.births.append((*own, steps, numpy_of(b.length)))
         for e in state.ended:
             steps = np.full(e.uid.numel(), state.step)
             fates = np.full(e.uid.numel(), FATES.index(e.fate))
-            self.ends.append((numpy_of(e.colony_id), numpy_of(e.uid), steps, fates))
+            own = (numpy_of(x) for x in (e.colony_id, e.uid))
+            self.ends.append((*own, steps, fates, numpy_of(e.length)))
 
     def _write(self, state: State) -> None:
         assert self.file is not None
@@ -394,7 +396,8 @@ class Recorder(metaclass=checks.KnownKeywords):
                 else [np.empty(0, np.int64)] * len(names)
             )
             for name, value in zip(names, merged, strict=True):
-                self._append(f"lineage/{table}/{name}", value, sizes[table])
+                if f"lineage/{table}/{name}" in file:  # older files have no lengths
+                    self._append(f"lineage/{table}/{name}", value, sizes[table])
             sizes[table] += len(merged[0])
         for name, value in colony_columns(state).items():
             self._append(f"frames/colony/{name}", value[None], frame)

@@ -18,9 +18,10 @@ COPY, NUMBER, UNIFORM = range(3)
 
 
 @kernel(entry=True)
-def due_rows(flag, size, threshold, length, radius):
+def due_rows(flag, size, threshold, length, radius, need):
     """The rows (M,) of those of N cells that divide: those that are flagged, and those whose size
-    (N,), or (0,) for none, is not below its threshold. And how many of them are too short."""
+    (N,), or (0,) for none, is not below its threshold. And how many of them are shorter than `need`
+    radii."""
     rows, many, short = np.empty(flag.shape[0], np.int64), 0, 0
     for i in range(flag.shape[0]):
         due = flag[i]
@@ -29,24 +30,24 @@ def due_rows(flag, size, threshold, length, radius):
         if due:
             rows[many] = i
             many += 1
-            short += length[i] < radius[i] + radius[i]
+            short += length[i] < need * radius[i]
     return rows[:many].copy(), short
 
 
 @kernel(entry=True)
-def divide(rows, cells, ids, share, sd, lost, key, columns, numbers):
+def divide(rows, cells, ids, share, sd, caps, key, columns, numbers):
     """Makes two cells, side by side, of each of the M cells `rows` of N.
 
     cells: position (N, d) float64, axis (N, d), length and radius (N,) of one type. ids: colony,
-    uid and parent (N,), next uid and stream of each colony. share of the length that first
-    daughters get, and sd of the noise of axes: (M,), or (1,) for all. lost: radii of a parent's
-    length that daughters do not get. key (3,): the words of the
-    noise. columns (K, 8): places of all others, with `numbers` (K, 2) from which daughters begin.
+    uid and parent (N,), next uid and stream of each colony. share of what is conserved that first
+    daughters get, and sd of the noise of axes: (M,), or (1,) for all. caps: what they hold of it,
+    as radii of length. key (3,): the words of the noise. columns (K, 8): places of all others, with
+    `numbers` (K, 2) from which daughters begin.
     Returns the rows of the daughters (2 M,), first daughters first; uid, parent and the next uid of
     each colony, numbered on; and position, axis and length of N + M cells.
     """
     daughters, source, of_ids = _split(rows, ids)
-    made = _placed(rows, daughters, source, cells, share, lost)
+    made = _placed(rows, daughters, source, cells, share, caps)
     colony, stream, uid = ids[0], ids[4], of_ids[0]
     own = np.empty((daughters.shape[0], 2), np.int64)
     for k in range(daughters.shape[0]):
@@ -78,13 +79,13 @@ def _split(rows, ids):
 
 
 @kernel
-def _placed(rows, daughters, source, cells, share, lost):
+def _placed(rows, daughters, source, cells, share, caps):
     """Position, axis and length of the new cells; daughters have their parents' axes. All but the
     position is of one type, as torch would compute."""
     position, axis, length, radius = cells
     m, d = rows.shape[0], axis.shape[1]
-    half, one = length.dtype.type(0.5), length.dtype.type(1)
-    less, apart = length.dtype.type(lost), length.dtype.type(1 - 0.5 * lost)
+    half, one, two = length.dtype.type(0.5), length.dtype.type(1), length.dtype.type(2)
+    of_caps, apart = length.dtype.type(caps), length.dtype.type(1 - 0.5 * caps)
     new_position, new_axis = np.empty((source.size, d)), np.empty((source.size, d), axis.dtype)
     new_length = np.empty(source.size, length.dtype)
     for r in range(source.size):
@@ -95,8 +96,10 @@ def _placed(rows, daughters, source, cells, share, lost):
     for k in range(2 * m):
         parent, cell = rows[k % m], daughters[k]
         part = share[k % m] if share.shape[0] > 1 else share[0]
-        rest = length[parent] - less * radius[parent]
-        new_length[cell] = rest * (part if k < m else one - part)
+        own = of_caps * radius[parent]
+        rest, more = length[parent] - own, (two * part - one) * own
+        found = rest * part + more if k < m else rest * (one - part) - more
+        new_length[cell] = max(found, one - one)
         shift = half * (new_length[cell] - length[parent]) - apart * radius[parent]
         for c in range(d):
             moved = shift * axis[parent, c]

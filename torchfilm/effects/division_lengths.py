@@ -1,0 +1,67 @@
+"""Which cells are too short to divide, and how that is reported."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchfilm.state import State
+
+# Of what a division conserves, the two caps of a cell hold as much as this many radii of its
+# length.
+CAPS = {"length": 2.0, "volume": 4 / 3}
+TOO_SHORT = 1
+
+
+@dataclass(frozen=True)
+class DivisionReport:
+    """Which colonies could not divide, per colony (B,).
+
+    status: 0 or TOO_SHORT. uid, length: the first cell that was due and too short, µm. needs: the
+    length that it needs, µm. The report exists only if there is such a cell; no cell divided in its
+    colony.
+    """
+
+    status: Tensor
+    uid: Tensor
+    length: Tensor
+    needs: Tensor
+
+    hint: ClassVar[str] = "Divide later, or start from longer cells"
+
+    def reason(self, place: int) -> str:
+        """Describes the failure of the colony at this place of the batch."""
+        return (
+            f"cell {int(self.uid[place])} is due to divide at length {float(self.length[place]):g}"
+            f" µm, but needs at least {float(self.needs[place]):g} µm for two new caps"
+        )
+
+
+def least_length(share: Any, caps: float) -> Any:
+    """The least length, radii, of a cell that can divide into `share` and the rest of what is
+    conserved: no daughter has a length below 0. caps: see CAPS."""
+    share = share.detach() if isinstance(share, Tensor) else share
+    small = 0.5 - abs(share - 0.5)
+    return caps * (1.0 / small - 1.0)
+
+
+def without_short(state: State, rows: Tensor, need: Tensor) -> tuple[State, Tensor]:
+    """The state that reports those of the cells `rows` (M,) that are too short to divide, and which
+    are of other colonies, (M,) bool. need: (M,) or (), radii."""
+    needed = need * state.radius.index_select(0, rows)
+    too_short = state.length.index_select(0, rows) < needed
+    if not bool(too_short.any()):
+        return state, torch.ones_like(too_short)
+    lengths = torch.zeros_like(state.length).index_copy(0, rows, needed)
+    number = torch.arange(state.cells, 0, -1, device=state.device)
+    marks = torch.zeros_like(number).index_copy(0, rows, torch.where(too_short, number[rows], 0))
+    first = state.cells - state.groups.max(marks)
+    status = torch.where(first < state.cells, TOO_SHORT, 0)
+    row = first.clamp(max=state.cells - 1)
+    pick = lambda x: x.detach().index_select(0, row)
+    report = DivisionReport(status, pick(state.uid), pick(state.length), pick(lengths))
+    sound = (status != TOO_SHORT).index_select(0, state.colony.index_select(0, rows))
+    return state.replace(reports={**state.reports, "division": report}), sound
