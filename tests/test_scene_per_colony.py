@@ -120,3 +120,21 @@ def test_too_many_values_are_refused_by_name(name):
     scene = tf.Scene(*SHORT[name](torch.tensor([1.0, 2.0, 1.0, 2.0])), founders=cells_in(2))
     with pytest.raises(tf.InputError, match=name.split(".")[1]):
         scene.bind(3).start()
+
+
+STATED = tf.PerColony([5.0, 6.0])
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: tf.Mechanics([tf.Sphere(center=(0.0, 0.0), radius=STATED)], dim=2),
+        lambda: tf.Mechanics([tf.Plane(y=STATED, facing="-y")], dim=2),
+        lambda: tf.Mechanics([tf.Box((-5.0, -5.0), (STATED, 9.0))], dim=2),
+        lambda: tf.Removal(low=(-9.0, -9.0), high=(STATED, 9.0)),
+    ],
+)  # fmt: skip
+def test_what_is_stated_per_colony_stands_where_a_list_may(make):
+    scene = tf.Scene(tf.Growth(rate=1.0), make(), dim=2)
+    ((_, values),) = scene.per_colony()
+    assert values.tolist() == [5.0, 6.0] and scene.bind(2).start().colonies == 2

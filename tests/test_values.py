@@ -283,3 +283,9 @@ def test_values_in_a_transform_of_torch_func_are_refused(transform):
     ):
         with pytest.raises(tf.InputError, match=r"in a transform of torch.func.*tf.tangents"):
             transform(make)(torch.tensor([2.0, 3.0]))
+
+
+@pytest.mark.parametrize("bad", [0.5, "no", 1, None])
+def test_inherited_is_true_or_false(bad):
+    with pytest.raises(tf.InputError, match=r"Normal\.inherited = .* True or False"):
+        tf.Normal(1.0, 0.1, inherited=bad)

@@ -15,7 +15,7 @@ import torch
 
 from torchfilm.effect import BoundEffect, Effect
 from torchfilm.effects.bound_mechanics import BoundMechanics
-from torchfilm.effects.growth import Growth, wanted_elongation
+from torchfilm.effects.growth import MOST_GROWN, Growth, wanted_elongation
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.state import State
 from torchfilm.tools.numba_calls import as_array
@@ -45,7 +45,7 @@ class JoinedStep:
     def _lengthened(self, state: State, dt: float) -> tuple[np.ndarray, np.ndarray] | None:
         """How much longer cells become and how long they then are, (N,), as `Growth` has it; None
         where there are no cells, a derivative is wanted, numbers are not of one type, or a cell
-        would be of no finite length."""
+        would grow too far."""
         fields, dtype = state.fields, state.dtype
         rate = fields["growth_rate"]
         one_type = rate.dtype == state.radius.dtype == dtype
@@ -59,7 +59,10 @@ class JoinedStep:
         with np.errstate(all="ignore"):
             growth = wanted_elongation(self.law, relative, length, radius)
             after = length + growth
-        return (growth, after) if after.max() < math.inf else None
+        doubles = self.law != "linear" and "divide_flag" in fields
+        if not after.max() < math.inf or (doubles and not relative.max() <= MOST_GROWN):
+            return None
+        return growth, after
 
 
 def joined(effects: Sequence[Part]) -> list[Part | JoinedStep]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -13,8 +14,22 @@ from torchfilm.tools import checks
 from torchfilm.tools.warn_once import warn
 
 
+def near_name(name: str, known: Sequence[str]) -> str:
+    """A hint at the known name that is like this one, or ""."""
+    near = difflib.get_close_matches(name, known, 1, cutoff=0.75)
+    return f" Did you mean {near[0]!r}?" if near else ""
+
+
 class RuleError(checks.InputError, AttributeError):
     """A rule read an unknown name, or wrote an invalid value."""
+
+
+# `remove_flag` is no field, so daughters have none.
+REMOVED_LATER = (
+    "daughters have no remove_flag: rules remove cells in update(cells). Give Rules(…,"
+    " variables={'doomed': 0.0}), set daughter1.doomed = 1.0 in divide, and cells.remove_flag ="
+    " cells.doomed > 0 in update: the cell vanishes at the start of the next step."
+)
 
 
 def check_integers(name: str, tensor: Tensor, dtype: torch.dtype) -> None:

@@ -1,12 +1,10 @@
-"""Views of cells for the user's rules: Table 1's names, each a tensor over all cells.
-
-Rules may read every name, and write those that the model allows.
-"""
+"""Views of cells for the user's rules: Table 1's names, each a tensor over all cells, to read, and
+to write where the model allows."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -15,7 +13,15 @@ from torch import Tensor
 from torchfilm.circuits.names import Names
 from torchfilm.physics.nearby import gaps_nearby
 from torchfilm.rule_draws import Draws, OneCell
-from torchfilm.rule_values import RuleError, as_tensor, broadcast_copy, check_integers, real_column
+from torchfilm.rule_values import (
+    REMOVED_LATER,
+    RuleError,
+    as_tensor,
+    broadcast_copy,
+    check_integers,
+    near_name,
+    real_column,
+)
 from torchfilm.state import CELL, CELL_TYPE, COLONY, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import unchanged
@@ -70,19 +76,13 @@ def _known_names(state: State) -> list[str]:
     return [*GEOMETRY, *IDENTITY, *fields]
 
 
-def _near(name: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, known, 1, cutoff=0.75)
-    return f" Did you mean {near[0]!r}?" if near else ""
-
-
 class CellsView(Draws):
     """The cells as a rule sees them: every name is a tensor over all cells, (N,) or (N, d).
 
     `for cell in cells` gives them one by one (slow). A rule may read position (pos), axis (dir),
     length, radius, volume, area, uid, parent, colony, signals, the constants p that its rules were
-    given, and every field of the scene. It may
-    write fields, `divide_flag`, `remove_flag`, and new names, which become variables of the cell. A
-    tensor that was read may be changed in place.
+    given, and every field of the scene. It may write fields, `divide_flag`, `remove_flag`, and new
+    names, which become variables of the cell. A tensor that was read may be changed in place.
     """
 
     _state: State
@@ -171,7 +171,7 @@ class CellsView(Draws):
                 )
             known = _known_names(state)
             raise RuleError(
-                f"cells have no {name!r}; they have {', '.join(known)}.{_near(name, known)} A"
+                f"cells have no {name!r}; they have {', '.join(known)}.{near_name(name, known)} A"
                 " variable of your own"
                 f" needs a first value: give Rules(…, variables={{{name!r}: 0.0}})."
             )
@@ -227,9 +227,8 @@ class CellsView(Draws):
         if self._declaring and name not in (*state.fields, *KNOWN_FIELDS, "remove_flag"):
             if name in OF_EFFECTS:
                 raise RuleError(f"cells.{name} acts only with {OF_EFFECTS[name]} in the scene.")
-            near = difflib.get_close_matches(
-                name, [*state.fields, *KNOWN_FIELDS, "remove_flag", *PAPER_NAMES], 1, cutoff=0.82
-            )
+            known = [*state.fields, *KNOWN_FIELDS, "remove_flag", *PAPER_NAMES]
+            near = difflib.get_close_matches(name, known, 1, cutoff=0.82)
             if near:
                 raise RuleError(
                     f"cells.{name} is new: did you mean {near[0]!r}? If it is a variable of your"
@@ -369,7 +368,7 @@ class DivisionView(Draws):
             if not (name in GEOMETRY or name in IDENTITY or name in self._state.fields):
                 known = _known_names(self._state)
                 raise RuleError(
-                    f"cells have no {name!r}; they have {', '.join(known)}.{_near(name, known)}"
+                    f"cells have no {name!r}; they have {', '.join(known)}.{near_name(name, known)}"
                 )
             self._work[name] = self._copy(name)
         return self._work[name]
@@ -421,6 +420,8 @@ class DivisionView(Draws):
                 f"{self._name}.{name} can only be read: Division places the daughters (its"
                 " `fraction` divides the length); rules set fields."
             )
+        if name == "remove_flag":
+            raise RuleError(REMOVED_LATER)
         if not self._writable(name):
             own = ", ".join(filter(self._writable, _known_names(self._state)))
             first = (

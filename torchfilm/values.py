@@ -52,6 +52,11 @@ class PerColony(metaclass=checks.KnownKeywords):
 
     values: Tensor | Sequence[float]
 
+    @property
+    def one_per_colony(self) -> Tensor | Sequence[float]:
+        """What `checks.value` takes, for what is one per colony in any case."""
+        return self.values
+
 
 @dataclass(frozen=True, eq=False)
 class ByType:
@@ -265,6 +270,10 @@ class Distribution(metaclass=checks.KnownKeywords):
         raise NotImplementedError
 
     def _check(self, **rules: Rule) -> None:
+        if not isinstance(self.inherited, bool):
+            raise checks.input_error(
+                f"{type(self).__name__}.inherited", self.inherited, "True or False"
+            )
         for name, rule in rules.items():
             made = checked(f"{type(self).__name__}.{name}", getattr(self, name), rule)
             object.__setattr__(self, name, made)

@@ -262,3 +262,29 @@ def test_rules_follow_the_poles():
     assert bool((state.parent[order[::2]] == state.parent[order[1::2]]).all())
     # the step in which they divided has not moved them yet
     assert float(gap.max()) < 1e-5
+
+
+def test_cells_are_not_removed_as_they_are_born():
+    """It would be a variable that nothing reads: all daughters lived on."""
+
+    def divide(parent, daughter1, daughter2):
+        daughter2.remove_flag = True
+
+    scene = tf.Scene(tf.Rules(None, divide), tf.Growth(rate=1.0), tf.Division(length=4.0), dim=2)
+    with pytest.raises(tf.InputError, match=r"no remove_flag.*in update\(cells\).*doomed"):
+        scene.bind()
+    with pytest.raises(tf.InputError, match=r"Rules\.variables: remove_flag .* left out"):
+        tf.Rules(None, divide, variables={"remove_flag": 0.0})
+
+
+def test_what_the_message_says_removes_daughters():
+    def update(cells):
+        cells.remove_flag = cells.doomed > 0
+
+    def divide(parent, daughter1, daughter2):
+        daughter2.doomed = 1.0
+
+    rules = tf.Rules(update, divide, variables={"doomed": 0.0})
+    scene = tf.Scene(rules, tf.Growth(rate=1.0), tf.Division(length=4.0), dim=2)
+    *_, state = tf.simulate(scene, until=4.0)
+    assert state.cells == 1 and int(state.uid[0]) > 4

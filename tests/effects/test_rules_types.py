@@ -354,3 +354,14 @@ def test_signals_can_only_be_read():
     )
     with pytest.raises(tf.InputError, match=r"changed cells\.signals\.food in place"):
         tf.Scene(tf.Rules(eats, variables={"mark": 0.0}), medium, dim=2).bind()
+
+
+def test_a_type_below_0_fails_its_colony():
+    def mutate(cells):
+        cells.cell_type = torch.where((cells.colony == 1) & (cells.length > 3.0), -2, 0)
+
+    one = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 2.0, cell_type=[0])
+    scene = tf.Scene(tf.Rules(mutate), tf.Growth(rate=1.0), tf.Division(), founders=one, dim=2)
+    with pytest.raises(tf.SimulationError, match=r"colony 1.*set to -2: .* a whole number from 0"):
+        for _ in tf.simulate(scene, until=1.0, colonies=2):
+            pass

@@ -186,16 +186,16 @@ class BoundRule(BoundEffect):
             return ~(value >= 0)
         if name == "drag":
             return ~(value > 0)
-        if name == "cell_type" and self.types:
+        if name == "cell_type":
             unknown = [~torch.isin(value, value.new_tensor(t)) for t in self.types.values()]
-            return torch.stack(unknown).any(0)
+            return torch.stack([value < 0, *unknown]).any(0)
         if not value.is_floating_point() or name not in self.shared:
             return None
         return _of_rows(value.isnan())
 
     def _words(self, name: str, value: Tensor) -> str:
         """What is wrong with a value of this name, and what to do."""
-        if name == "cell_type":
+        if name == "cell_type" and value >= 0:
             kind = int(value)
             lacking, types = next((n, t) for n, t in self.types.items() if kind not in t)
             return (
@@ -205,6 +205,7 @@ class BoundRule(BoundEffect):
         allowed = {
             "growth_rate": "at least 0. To let cells vanish, set remove_flag",
             "drag": "above 0",
+            "cell_type": "a whole number from 0",
         }.get(name, "at least 0" if name in self.least_zero and value < 0 else "a number")
         shown = f"{float(value):g}" if value.dim() == 0 else value.tolist()
         return f"was set to {shown}: it must be {allowed}"

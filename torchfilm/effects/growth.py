@@ -21,24 +21,33 @@ from torchfilm.tools.warn_once import warn
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, numbers, physical
 
 LAWS = ("volume", "length", "linear")
+MOST_GROWN = 1.001  # of its size, that a cell may add in a step where cells divide; with rounding
 UNITS = {"volume": "1/h", "length": "1/h of the length", "linear": "µm/h"}
 
 
 @dataclass(frozen=True)
 class GrowthReport:
-    """Made only where a cell would grow past all numbers: `status` (B,), 1 for its colony, in which
-    no cell grew, and the `rate` (B,) and `uid` (B,) of the first such cell."""
+    """Made only where a cell would grow past all numbers, or to more than twice its size in a step
+    of a scene in which cells divide: `status` (B,), 1 for its colony, in which no cell grew; and,
+    (B,), the `uid` and `rate` of the first such cell, and how many times larger it would be,
+    `grown`."""
 
     status: Tensor
     uid: Tensor
     rate: Tensor
+    grown: Tensor
     hint = "A smaller dt or growth rate may help (rates are per hour, and dt is in hours)"
 
     def reason(self, place: int) -> str:
         """What went wrong in the colony at this place of the batch."""
+        cell, grown = f"cell {int(self.uid[place])}", float(self.grown[place])
+        if grown < math.inf:
+            return (
+                f"{cell} would become {grown:.3g} times as large in one step. Cells that divide may"
+                " at most double, or their numbers would be wrong"
+            )
         return (
-            f"cell {int(self.uid[place])} at a growth rate of {float(self.rate[place]):g} would be"
-            " of no finite length"
+            f"{cell} at a growth rate of {float(self.rate[place]):g} would be of no finite length"
         )
 
 
@@ -221,9 +230,11 @@ class Growth(Effect):
             relative = torch.expm1(relative)
         elongation = wanted_elongation(self.law, relative, state.length, state.radius)
         length = state.length + elongation
-        # one look at the longest: NaN is the largest of all
-        if state.cells and not length.max().item() < math.inf:
-            report = _too_long(state, torch.isfinite(length))
+        good = torch.isfinite(length)
+        if self.law != "linear" and "divide_flag" in state.fields:
+            good = good & (relative <= MOST_GROWN)
+        if state.cells and not bool(good.all()):
+            report = _too_long(state, good, torch.where(torch.isfinite(length), relative, math.inf))
             elongation = torch.where(
                 (report.status == 0).index_select(0, state.colony), elongation, 0.0
             )
@@ -312,9 +323,9 @@ def _first_rate(state: State, rows: Tensor, values: Values) -> Tensor:
     return values.rate.of_rows(state, rows)
 
 
-def _too_long(state: State, good: Tensor) -> GrowthReport:
-    """The report of the cells that cannot be as long as they would be, ~good (N,)."""
+def _too_long(state: State, good: Tensor, relative: Tensor) -> GrowthReport:
+    """The report of the cells that cannot be as long as they would be, ~good (N,), which grow by
+    `relative` (N,)."""
     row, bad = state.groups.first(~good)
-    return GrowthReport(
-        bad.long(), state.uid.index_select(0, row), state.growth_rate.detach().index_select(0, row)
-    )
+    pick = lambda x: x.detach().index_select(0, row)
+    return GrowthReport(bad.long(), pick(state.uid), pick(state.growth_rate), 1 + pick(relative))

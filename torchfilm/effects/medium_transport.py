@@ -22,6 +22,7 @@ from torchfilm.signals.schedule import at_time, each_value, schedules
 from torchfilm.signals.transport import Carrier, carry, check_method, choose, prepare
 from torchfilm.signals.transport_operator import Operator
 from torchfilm.signals.transport_rates import build_operator
+from torchfilm.signals.transport_series import FARTHEST, Series
 from torchfilm.signals.transport_uptake import UptakeTransport
 from torchfilm.state import OUTSIDE, State
 from torchfilm.tools import checks
@@ -266,6 +267,14 @@ class Transport:
         )
         wanted = tracked(*coefficients)
         stepper = prepare(made, dt, self.medium.method or choose(made))
+        most = float(stepper.exchanges.max()) if isinstance(stepper, Series) else 0.0
+        if not most <= FARTHEST:
+            raise checks.input_error(
+                f"transport of the signal {name!r}",
+                f"{most:.2g} exchanges of a voxel in a step of {dt:g} h",
+                f"at most {FARTHEST:g}, beyond which rounding decides",
+                "Is diffusion in µm²/h? A slower one, a shorter step or a coarser spacing will do.",
+            )
         return Carrier(stepper, batch.shape, self.compiled and not wanted), wanted
 
     def _operator(self, name: str, state: State, batch: GridBatch) -> Operator:

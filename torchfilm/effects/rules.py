@@ -78,6 +78,9 @@ class Rules(Effect):
                 " tf.Rules(update)."
             )
         for name, value in self.variables.items():
+            if name == "remove_flag":
+                allowed = "left out: update(cells) sets it without a first value"
+                raise checks.input_error("Rules.variables: remove_flag", value, allowed)
             if name in OF_EFFECTS:
                 raise checks.input_error(
                     f"Rules.variables: {name}",

@@ -25,6 +25,8 @@ from torchfilm.signals.transport_operator import Operator
 
 # λΔt up to which a colony takes the series: some 1,200 terms.
 MOST = 1000.0
+# More exchanges of a voxel in a step leave nothing but rounding of backward Euler's solve.
+FARTHEST = 1e12
 # λ over the greatest loss rate: each voxel keeps a part of its content larger than all roundings.
 ABOVE = 1.01
 # Weights below this part of the precision of the values are left out.

@@ -249,6 +249,7 @@ def value(
     Raises InputError if an entry is outside the bounds; hint: the forms that are allowed. A tensor
     keeps its gradient.
     """
+    given = getattr(given, "one_per_colony", given)  # of a PerColony
     if isinstance(given, (list, tuple)):
         devices = [x.device for x in given if isinstance(x, Tensor)]
         try:
