@@ -42,6 +42,7 @@ def _same(a: object, b: object) -> bool:
 def shorten(value: object) -> str:
     """A value in few characters."""
     if isinstance(value, torch.Tensor):
+        value = value.detach()
         if value.dim() == 0:
             return f"{float(value):.9g}"
         return f"<{value.numel()} values, {float(value.min()):g} to {float(value.max()):g}>"

@@ -354,7 +354,7 @@ def test_it_is_explained_who_computes():
     with pytest.raises(tf.InputError, match="backend = 'compiled', but branching: it uses a sum"):
         said(tf.Circuit(branching, species="a", backend="compiled"))
     learnt = said(toggle(k=torch.tensor(2.0, requires_grad=True)))
-    assert "computed by torch: switch: p.k requires a gradient" in learnt
+    assert "where gradients are required by torch, with derivatives from them" in learnt
     assert "computed by compiled functions" in said(toggle(method="rk4"))
     assert "computed by torch: backend='torch'" in said(toggle(method="rk4", backend="torch"))
 

@@ -143,6 +143,16 @@ def test_bad_regions_are_refused(low, high):
         tf.Removal(low, high)
 
 
+def test_a_corner_that_is_left_out_is_no_limit():
+    assert tf.Removal(high=(5.0, math.inf)).low == (-math.inf, -math.inf)
+    assert tf.Removal(low=[0, 0, [1.0, 2.0]]).high == (math.inf,) * 3
+    scene = tf.Scene(Drift(), tf.Removal(high=(10.0, math.inf)), founders=at(0.0, 9.5))
+    *_, state = tf.simulate(scene, until=1.0)
+    assert state.uid.tolist() == [0]
+    with pytest.raises(tf.InputError, match="no limits: give low, high, or both"):
+        tf.Removal()
+
+
 def test_wrong_dimension_is_refused():
     with pytest.raises(tf.InputError, match=r"Removal\.low.*3 numbers"):
         tf.Scene(tf.Removal((-1, -1), (1, 1)), founders=at(0.0, dim=3)).bind().start()

@@ -182,8 +182,6 @@ class Trace:
             if name not in home:
                 return None
             value = torch.as_tensor(home[name])
-            if value.requires_grad:
-                raise Untraceable(f"{prefix}.{name} requires a gradient")
             if value.dim() > 1:
                 raise Untraceable(f"{prefix}.{name} has several numbers for each cell")
             self.kinds[f"{prefix}.{name}"] = (value.dtype, value.dim())

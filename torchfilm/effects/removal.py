@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,24 +18,33 @@ from torchfilm.tools.row_checks import check_none_taken
 from torchfilm.values import COLONY, Rule
 
 
+def _or_no_limits(corner: Any, other: Any, value: float) -> Any:
+    """The corner, or one of this value as long as the other where it was left out."""
+    left_out = isinstance(corner, tuple) and not corner and hasattr(other, "__len__")
+    return (value,) * len(other) if left_out else corner
+
+
 @dataclass(frozen=True, eq=False)
 class Removal(Effect):
     """Removes cells whose centre leaves the box from `low` to `high`, as at a channel's open end.
 
-    low, high: corners, µm, each entry one number or one per colony; ±inf means no limit.
+    low, high: corners, µm, each entry one number or one per colony; ±inf means no limit, and so
+    does a corner that is left out.
     """
 
-    low: Sequence[float | Tensor]
-    high: Sequence[float | Tensor]
+    low: Sequence[float | Tensor] = ()
+    high: Sequence[float | Tensor] = ()
 
     stage = REMOVAL
     title = "removal"
     by_kernels = True
 
     def __post_init__(self) -> None:
-        for name, corner in zip(
-            ("low", "high"), checks.corners("Removal", self.low, self.high), strict=True
-        ):
+        low, high = _or_no_limits(self.low, self.high, -math.inf), self.high
+        high = _or_no_limits(high, low, math.inf)
+        if isinstance(low, tuple) and not low:
+            raise checks.InputError("Removal() has no limits: give low, high, or both.")
+        for name, corner in zip(("low", "high"), checks.corners("Removal", low, high), strict=True):
             object.__setattr__(self, name, corner)
 
     def reads(self) -> tuple[str, ...]:

@@ -124,7 +124,7 @@ def biofilm(
             grows="xyz" if layer is None else "+y",
             margin=layer,
         ),
-        Removal(low=(-math.inf, -math.inf), high=(math.inf, height - BELOW)),
+        Removal(high=(math.inf, height - BELOW)),
         *([] if erosion is None else [Erosion(erosion)]),
         founders=partial(_on_the_floor, first, width),
         dt=0.05,
