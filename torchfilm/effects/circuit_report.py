@@ -41,7 +41,7 @@ class CircuitReport:
     shared: frozenset[str] = frozenset()
     hint = (
         "Look at the signs of the rates (none may be below 0 where its species is 0), at their"
-        " units (per hour), and at whether they stay finite; a smaller dt may help"
+        " units (per hour), and at whether they stay finite and do not jump; a smaller dt may help"
     )
 
     def reason(self, place: int) -> str:
