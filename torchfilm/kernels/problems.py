@@ -24,6 +24,15 @@ from torchfilm.kernels.solve_parts import (
 from torchfilm.kernels.team import next_of
 
 
+@lean
+def _next(memory, which, taken, begin, at):
+    """The first colony that no thread has taken, or −1; its cells, and its rows."""
+    give_back(memory, 0)
+    b = next_of(which, taken)
+    c = max(b, 0)
+    return b, begin[c], begin[c + 1], at[c], at[c + 1]
+
+
 @lean(entry=True)
 def minimise_colonies(memory, taken, which, begin, at, rows, gaps, pushed, alpha, low, y, tolerance,
                       caps, limit, after, errors, iterations, alone, dof):  # fmt: skip
@@ -34,11 +43,9 @@ def minimise_colonies(memory, taken, which, begin, at, rows, gaps, pushed, alpha
     """
     H, one, two = rows
     while True:
-        give_back(memory, 0)
-        b = next_of(which, taken)
+        b, first, end, r, last = _next(memory, which, taken, begin, at)
         if b < 0:
             return
-        first, end, r, last = begin[b], begin[b + 1], at[b], at[b + 1]
         found = minimise(
             memory, H[2 * r : 2 * last], one[r:last], two[r:last], last - r, gaps[r:last],
             pushed[r:last], alpha[first:end], low[first:end], y[first:end], tolerance, caps[b],
@@ -99,11 +106,9 @@ def solve_colonies(memory, taken, which, begin, at, rows, act, alpha, held, g, x
     """
     H, one, two = rows
     while True:
-        give_back(memory, 0)
-        b = next_of(which, taken)
+        b, first, end, r, last = _next(memory, which, taken, begin, at)
         if b < 0:
             return
-        first, end, r, last = begin[b], begin[b + 1], at[b], at[b + 1]
         iterations[b], left[b] = _solve(
             memory, H[2 * r : 2 * last], one[r:last], two[r:last], act[r:last], alpha[first:end],
             held[first:end], g[first:end], x[first:end], tolerances[b], limit, dof,
