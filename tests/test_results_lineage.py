@@ -96,6 +96,20 @@ def test_a_file_of_an_earlier_version_has_no_lengths_and_goes_on(tmp_path):
     assert np.isnan(tree.end_length).all()
 
 
+@pytest.mark.parametrize("fraction, warns", [(0.5, False), (0.4, True)])
+def test_an_earlier_file_of_uneven_divisions_is_warned_of(tmp_path, recwarn, fraction, warns):
+    """Fractions were those of the length less two radii."""
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0, fraction=fraction), dim=2)
+    path = tmp_path / "old.h5"
+    for _ in tf.simulate(scene, until=0.2, record=path):
+        pass
+    with h5py.File(path, "r+") as file:
+        file.attrs["version"] = 2
+    with tf.Results(path) as results:
+        results.state(scene)
+    assert any("Division.fraction was" in str(w.message) for w in recwarn) == warns
+
+
 def test_ancestors_and_descendants(whole):
     with tf.Results(whole[0]) as results:
         tree = results.lineage()

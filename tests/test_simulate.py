@@ -212,7 +212,7 @@ def test_failures_of_two_kinds_are_raised_together():
     assert caught.value.colonies == (0, 1, 2)
     said = str(caught.value)
     assert (
-        said.count("two new caps") == 2
+        said.count("caps of its daughters") == 2
         and said.count("iteration limit") == 2
         and "smaller dt" in said
         and "longer cells" in said

@@ -15,7 +15,7 @@ import torch
 
 from torchfilm.effect import BoundEffect, Effect
 from torchfilm.effects.bound_mechanics import BoundMechanics
-from torchfilm.effects.growth import MOST_GROWN, Growth, wanted_elongation
+from torchfilm.effects.growth import MOST_GROWN, Growth, doubling_matters, wanted_elongation
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.state import State
 from torchfilm.tools.numba_calls import as_array
@@ -59,8 +59,10 @@ class JoinedStep:
         with np.errstate(all="ignore"):
             growth = wanted_elongation(self.law, relative, length, radius)
             after = length + growth
-        doubles = self.law != "linear" and "divide_flag" in fields
-        if not after.max() < math.inf or (doubles and not relative.max() <= MOST_GROWN):
+            if self.law == "linear":
+                relative = growth / (length + radius * (4.0 / 3.0))
+        matters = doubling_matters(self.law, state)
+        if not after.max() < math.inf or (matters and not relative.max() <= MOST_GROWN):
             return None
         return growth, after
 

@@ -410,6 +410,8 @@ class DivisionView(Draws):
 
     def __setattr__(self, name: str, value: Any) -> None:
         name = PAPER_NAMES.get(name, name)
+        if name == "remove_flag":
+            raise RuleError(REMOVED_LATER)
         if self._rows is None:
             raise RuleError(
                 f"parent.{name} can only be read, since the parent no longer exists. Set"
@@ -420,8 +422,6 @@ class DivisionView(Draws):
                 f"{self._name}.{name} can only be read: Division places the daughters (its"
                 " `fraction` divides the length); rules set fields."
             )
-        if name == "remove_flag":
-            raise RuleError(REMOVED_LATER)
         if not self._writable(name):
             own = ", ".join(filter(self._writable, _known_names(self._state)))
             first = (

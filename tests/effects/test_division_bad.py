@@ -10,6 +10,7 @@ from dividing import flagged, row_of_cells
 from helpers import step
 
 import torchfilm as tf
+from torchfilm.effects.division_lengths import CAPS, least_length
 from torchfilm.physics import capsule
 
 
@@ -88,6 +89,43 @@ def test_a_threshold_too_low_for_the_shorter_daughter_is_refused(threshold, frac
     else:
         with pytest.raises(tf.InputError, match=words):
             scene.bind().start()
+
+
+@pytest.mark.parametrize(
+    "length, fraction",
+    [
+        (tf.PerColony([6.0, 2.5]), tf.PerColony([0.2, 0.5])),
+        ({0: 6.0, 1: 2.5}, {0: 0.2, 1: 0.5}),
+        ({0: 6.0, 1: 2.5}, {0: tf.Uniform(0.2, 0.3), 1: 0.5}),
+        (tf.PerColony([9.0, 2.5]), tf.Normal([0.3, 0.5], [0.04, 0.001])),
+        (3.0, tf.Uniform(0.45, 0.5)),
+    ],
+)
+def test_each_cell_is_judged_by_its_own_fraction(length, fraction):
+    cells = tf.Cells([[0.0, 0.0], [9.0, 0.0]], [[1.0, 0.0]] * 2, 2.0, 0.5, cell_type=[0, 1])
+    tf.Scene(tf.Division(length=length, fraction=fraction), founders=cells).bind(2).start()
+
+
+@pytest.mark.parametrize("fraction", [1e-300, tf.Uniform(1e-320, 0.5), 1e-17])
+def test_tiny_fractions_are_refused_in_words(fraction):
+    scene = tf.Scene(tf.Division(length=3.0, fraction=fraction), founders=row_of_cells(1))
+    with pytest.raises(tf.InputError, match=r"nearer to 0\.5"):
+        scene.bind().start()
+
+
+@pytest.mark.parametrize("by_torch", [False, True])
+def test_who_is_too_short_does_not_depend_on_the_others(by_torch, monkeypatch):
+    """A cell of exactly the length that it needs, in float32, beside one that is far too short."""
+    if by_torch:
+        monkeypatch.setattr("torchfilm.effects.division.knows_due", lambda *_: False)
+    fraction, radius = 0.935, torch.tensor(0.37)
+    cell = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 12.0, 0.37)
+    scene = tf.Scene(tf.Division(fraction=fraction), founders=cell)
+    state = flagged(scene, 2, dtype=torch.float32)
+    just = least_length(fraction, CAPS["length"]) * radius
+    for other in (20.0, 0.1):
+        after = step(scene, state.replace(length=torch.stack([just, torch.tensor(other)])), 0.1)
+        assert after.counts.tolist() == [2, 2 if other > 1 else 1]
 
 
 @pytest.mark.parametrize("by_torch", [False, True])

@@ -59,6 +59,17 @@ def test_only_the_colony_in_which_it_happens(contacts):
     assert (state.counts > 0).tolist() == [True, False, True]
 
 
+@CONTACTS
+def test_linear_growth_too(contacts):
+    """Of 2 µm with caps of 2/3 µm in volume: 2.6 µm in a step are less than as much, 2.8 more."""
+    division = tf.Division(length=4.0)
+    law = lambda more: tf.Growth(rate=more / 0.05, law="linear")
+    model = tf.Scene(law(2.6), division, *contacts, dim=2, dt=0.05).bind()
+    assert not tf.failures(model.step(model.start()))
+    model = tf.Scene(law(2.8), division, *contacts, dim=2, dt=0.05).bind()
+    assert "2.05 times as large" in str(tf.failures(model.step(model.start())))
+
+
 def test_where_no_cell_divides_it_may_be():
     scene = tf.Scene(*by_rule(3.0), dim=2, dt=0.05)
     *_, state = tf.simulate(scene, until=0.1)

@@ -273,6 +273,9 @@ def test_cells_are_not_removed_as_they_are_born():
     scene = tf.Scene(tf.Rules(None, divide), tf.Growth(rate=1.0), tf.Division(length=4.0), dim=2)
     with pytest.raises(tf.InputError, match=r"no remove_flag.*in update\(cells\).*doomed"):
         scene.bind()
+    with pytest.raises(tf.InputError, match="no remove_flag"):
+        of_parent = lambda parent, one, other: setattr(parent, "remove_flag", True)
+        tf.Scene(tf.Rules(None, of_parent), tf.Growth(rate=1.0), tf.Division(), dim=2).bind()
     with pytest.raises(tf.InputError, match=r"Rules\.variables: remove_flag .* left out"):
         tf.Rules(None, divide, variables={"remove_flag": 0.0})
 

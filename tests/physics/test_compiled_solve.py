@@ -87,6 +87,10 @@ def test_an_adjoint_solve_that_is_cut_short_or_no_number_says_so(solve):
     b[0, 0] = torch.nan
     bad = solve(problem, active.double(), free, b, tolerance, 5000)
     assert not bool(bad.worst[0] <= 1.0) and bool(bad.worst[1] <= 1.0)
+    b[:9] = 0.0
+    b[2, 1] = torch.nan  # alone among zeros
+    bad = solve(problem, active.double(), free, b, tolerance, 5000)
+    assert not bool(bad.worst[0] <= 1.0) and bool(bad.worst[1] <= 1.0)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -20,7 +20,7 @@ from torchfilm.effects.compiled_division import (
     known_number,
     knows_due,
 )
-from torchfilm.effects.division_lengths import CAPS, least_length, without_short
+from torchfilm.effects.division_lengths import CAPS, least_length, smaller_shares, without_short
 from torchfilm.physics import capsule
 from torchfilm.resolver import Resolved, Values
 from torchfilm.state import CELL, Births, Ended, Field, State
@@ -164,19 +164,20 @@ class Division(Effect):
         if self.criterion == "added":
             return
         # daughters keep the radius, so a cell's own threshold is compared with its own radius
-        small = min(smallest(self.fraction), 1.0 - largest(self.fraction))
-        needed = float(least_length(small, CAPS[self.conserves])) * state.radius
+        small = smaller_shares(self.fraction, values.fraction, state)
+        needed = least_length(small, CAPS[self.conserves]) * state.radius
         if self.criterion == "volume":
             needed = capsule.volume(needed, state.radius)
         short = torch.nonzero(least < needed * (1 - 1e-6)).squeeze(1)
         if short.numel():
             k = int(short[0])
+            share = float(small[k])
             raise checks.InputError(
                 f"Division.{self.criterion} can be {float(least[k]):g}: it must be at least"
                 f" {float(needed[k]):g} for radius {float(state.radius[k]):g} µm"
-                + (f" and a fraction of {small:g}" if small < 0.5 else "")
+                + (f" and a fraction of {share:g}" if share < 0.5 else "")
                 + ", or the daughters would have a negative length (each has two caps). Raise the"
-                " threshold" + (", or take a fraction nearer to 0.5." if small < 0.5 else ".")
+                " threshold" + (", or take a fraction nearer to 0.5." if share < 0.5 else ".")
             )
 
     def _bounds(self, state: State) -> tuple[Tensor, Tensor]:
@@ -217,8 +218,9 @@ class Division(Effect):
         return flag if size is None else flag | (size >= state.fields["division_threshold"])
 
     def step(self, state: State, dt: float, values: Values) -> State:
-        due = _due_by_torch(self, state, self.need(values))
-        return _divided_where_due(state, *due, values, None, CAPS[self.conserves])
+        need = self.need(values)
+        due = _due_by_torch(self, state, need)
+        return _divided_where_due(state, *due, need, values, None, CAPS[self.conserves])
 
     def need(self, values: Values) -> Any:
         """The length that a cell needs to divide, radii: one number, or None where its daughters'
@@ -249,7 +251,7 @@ class _BoundDivision(BoundEffect):
         if rows is None:
             return state
         more = self._fresh(state), CAPS[self.effect.conserves]
-        return _divided_where_due(state, rows, some_short, self.values, *more)
+        return _divided_where_due(state, rows, some_short, need, self.values, *more)
 
     def _fresh(self, state: State) -> dict[str, float | Drawn] | None:
         """With what daughters begin in the fields that a division resets, if all do so by numbers
@@ -284,19 +286,23 @@ def _divided_where_due(
     state: State,
     rows: Tensor | None,
     some_short: int,
+    need: Any,
     values: Values,
     fresh: Mapping[str, float | Drawn] | None,
     caps: float,
 ) -> State:
     """The state in which the cells `rows` are divided, but those of colonies in which one is too
-    short: if any is, or where each has a share of its own. fresh, caps: as `divide` has them."""
+    short: if any is, or where each has a share of its own. need: as `Division.need` has it. fresh,
+    caps: as `divide` has them."""
     if rows is None:
         return state
     share = _of_rows(values.fraction, state, rows, "Division.fraction")
     if some_short or share.dim():
         with torch.no_grad():
-            state, sound = without_short(state, rows, least_length(share, caps))
-        rows, share = rows[sound], share[sound] if share.dim() else share
+            need = least_length(share, caps) if need is None else need
+            state, sound = without_short(state, rows, need)
+        if sound is not None:
+            rows, share = rows[sound], share[sound] if share.dim() else share
     return divide(state, rows, share, values.axis_noise, fresh, caps) if rows.numel() else state
 
 

@@ -8,7 +8,9 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from torchfilm.resolver import Resolved
 from torchfilm.state import State
+from torchfilm.values import ByType, is_drawn, largest, smallest
 
 # Of what a division conserves, the two caps of a cell hold as much as this many radii of its
 # length.
@@ -36,25 +38,44 @@ class DivisionReport:
         """Describes the failure of the colony at this place of the batch."""
         return (
             f"cell {int(self.uid[place])} is due to divide at length {float(self.length[place]):g}"
-            f" µm, but needs at least {float(self.needs[place]):g} µm for two new caps"
+            f" µm, but needs at least {float(self.needs[place]):g} µm for the caps of its daughters"
         )
 
 
 def least_length(share: Any, caps: float) -> Any:
     """The least length, radii, of a cell that can divide into `share` and the rest of what is
     conserved: no daughter has a length below 0. caps: see CAPS."""
-    share = share.detach() if isinstance(share, Tensor) else share
-    small = 0.5 - abs(share - 0.5)
-    return caps * (1.0 / small - 1.0)
+    if not isinstance(share, Tensor):
+        return caps * (1.0 / min(share, 1.0 - share) - 1.0)
+    share = share.detach()
+    return caps * (1.0 / torch.minimum(share, 1.0 - share) - 1.0)
 
 
-def without_short(state: State, rows: Tensor, need: Tensor) -> tuple[State, Tensor]:
+def smaller_shares(fraction: Any, resolved: Resolved, state: State) -> Tensor:
+    """The least that either daughter of each cell can get, (N,) float64; 0.5 where it is drawn
+    from what differs between colonies. resolved: the fraction on the state's device."""
+    if not is_drawn(fraction):
+        share = resolved.of_cells(state).detach().double()
+        return torch.minimum(share, 1.0 - share).expand(state.cells)
+    least = torch.full_like(state.length, 0.5, dtype=torch.float64)
+    of_types = fraction.values if isinstance(fraction, ByType) else {None: fraction}
+    for kind, value in of_types.items():
+        parts = vars(value).values() if is_drawn(value) else [value]
+        if all(torch.as_tensor(x).numel() == 1 for x in parts):
+            small = min(smallest(value), 1.0 - largest(value))
+            mine = True if kind is None else state.fields["cell_type"] == kind
+            least = torch.where(torch.as_tensor(mine, device=least.device), small, least)
+    return least
+
+
+def without_short(state: State, rows: Tensor, need: Any) -> tuple[State, Tensor | None]:
     """The state that reports those of the cells `rows` (M,) that are too short to divide, and which
-    are of other colonies, (M,) bool. need: (M,) or (), radii."""
+    are of other colonies, (M,) bool; None where no cell is too short. need: radii, one number or
+    (M,)."""
     needed = need * state.radius.index_select(0, rows)
     too_short = state.length.index_select(0, rows) < needed
     if not bool(too_short.any()):
-        return state, torch.ones_like(too_short)
+        return state, None
     lengths = torch.zeros_like(state.length).index_copy(0, rows, needed)
     number = torch.arange(state.cells, 0, -1, device=state.device)
     marks = torch.zeros_like(number).index_copy(0, rows, torch.where(too_short, number[rows], 0))

@@ -230,11 +230,13 @@ class Growth(Effect):
             relative = torch.expm1(relative)
         elongation = wanted_elongation(self.law, relative, state.length, state.radius)
         length = state.length + elongation
-        good = torch.isfinite(length)
-        if self.law != "linear" and "divide_flag" in state.fields:
+        good = finite = torch.isfinite(length)
+        if doubling_matters(self.law, state):
+            if self.law == "linear":
+                relative = elongation / (state.length + state.radius * (4.0 / 3.0))
             good = good & (relative <= MOST_GROWN)
         if state.cells and not bool(good.all()):
-            report = _too_long(state, good, torch.where(torch.isfinite(length), relative, math.inf))
+            report = _too_long(state, good, torch.where(finite, relative, math.inf))
             elongation = torch.where(
                 (report.status == 0).index_select(0, state.colony), elongation, 0.0
             )
@@ -308,6 +310,12 @@ class _BoundGrowth(BoundEffect):
                 + ", or let the later one read growth_rate and change it (an effect of your own"
                 " names what it reads in reads())."
             )
+
+
+def doubling_matters(law: str, state: State) -> bool:
+    """Whether a cell that more than doubles in a step would be wrong: cells divide, and, where they
+    grow by "linear", by a threshold. (A rule may let such cells divide in each step.)"""
+    return ("division_threshold" if law == "linear" else "divide_flag") in state.fields
 
 
 def wanted_elongation(law: str, relative: Any, length: Any, radius: Any) -> Any:

@@ -71,7 +71,7 @@ class Mechanics(Effect):
     max_iterations: CG iterations a solve. max_elongation: µm; a colony whose cells would grow more
     in a step takes sub-steps. adhesion: cells stick together, see `tf.Adhesion`; several kinds add
     up. Only one-sided contacts have it. backend: "compiled" kernels, on the CPU, or "torch".
-    Default: compiled; where gradients are required, torch assembles what kernels solve.
+    Default: compiled; where gradients are required torch, whose one-sided contacts kernels solve.
     """
 
     walls: Sequence[Wall] = ()

@@ -273,7 +273,8 @@ class Transport:
                 f"transport of the signal {name!r}",
                 f"{most:.2g} exchanges of a voxel in a step of {dt:g} h",
                 f"at most {FARTHEST:g}, beyond which rounding decides",
-                "Is diffusion in µm²/h? A slower one, a shorter step or a coarser spacing will do.",
+                "Are diffusion in µm²/h and decay in 1/h? Slower ones, a shorter step or a coarser"
+                " spacing will do.",
             )
         return Carrier(stepper, batch.shape, self.compiled and not wanted), wanted
 

@@ -9,13 +9,18 @@ from typing import Any
 
 import h5py
 
+from torchfilm.effect import Effect
+from torchfilm.effects.division import Division
 from torchfilm.model import Model
 from torchfilm.physics.surfaces import as_data
 from torchfilm.scene import Scene
 from torchfilm.state import State
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.listings import list_kinds
-from torchfilm.tools.warn_once import quietly
+from torchfilm.tools.warn_once import quietly, warn
+
+# The first version of the format in which `Division.fraction` is a share of whole cells.
+OF_WHOLE_CELLS = 3
 
 
 def scene_attributes(scene: Scene, model: Model | None) -> dict[str, str]:
@@ -80,3 +85,15 @@ def check_same_scene(attributes: Mapping[str, Any], path: object, scene: Scene) 
             " --changed; in Python results.state(scene, changed=True) and Recorder(…,"
             " changed=True)."
         )
+    if int(attributes["version"]) < OF_WHOLE_CELLS and any(map(_divides_unevenly, scene.effects)):
+        warn(
+            f"{path} is of an earlier version, in which Division.fraction was the share of a cell's"
+            " length less two radii. It is that of the length with its caps now, so that daughters"
+            " differ more."
+        )
+
+
+def _divides_unevenly(effect: Effect) -> bool:
+    if not isinstance(effect, Division):
+        return False
+    return not (isinstance(effect.fraction, float) and effect.fraction == 0.5)

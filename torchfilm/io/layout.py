@@ -13,8 +13,8 @@
     /signals_at_cells/NAME  scenes with a medium only: one row per cell, as in /cells: the
                           concentration that the cell finds
     /parameters/PATH      (B,), parameters with one value per colony: see `torchfilm.io.parameters`
-    /lineage/births       colony_id, uid, parent, step
-    /lineage/ends         colony_id, uid, step, fate
+    /lineage/births       colony_id, uid, parent, step, length
+    /lineage/ends         colony_id, uid, step, fate, length
 
 A frame holds the whole state, so every frame is a checkpoint. `frames/step` is written last: a
 frame without an entry there is incomplete and is ignored. Files contain data only; torchfilm

@@ -42,7 +42,8 @@ class Lineage:
     in the middle of another is not known, NaN · ended: h, NaN while it lives · fate: "alive",
     "divided", "removed", "left", "lysed", "eroded", "sloughed" or "failed" · birth_length,
     end_length: of the centreline, µm, when it was born and ended; NaN where that hour is NaN, and
-    in files of earlier versions · founder: uid of the first of its line in the file.
+    in files of earlier versions but for founders · founder: uid of the first of its line in the
+    file.
 
     Cells are named by uid, and in a run of several colonies by `colony`, an id, too. `course` reads
     the file, which must be open. Raises InputError for cells and colonies that the run does not

@@ -62,8 +62,10 @@ def _largest(z):
     largest = 0.0
     for i in range(z.shape[0]):
         for k in range(z.shape[1]):
-            if not abs(z[i, k]) <= largest:
-                largest = abs(z[i, k])
+            size = abs(z[i, k])
+            if size != size:
+                return size
+            largest = max(largest, size)
     return largest
 
 
