@@ -100,6 +100,13 @@ class RecordingState(State):
         self.log.quiet = False
         return found
 
+    def remove(self, gone: torch.Tensor, fate: str) -> State:
+        # what the lineage keeps of the cells is not what the effect goes by
+        self.log.quiet = True
+        found = super().remove(gone, fate)
+        self.log.quiet = False
+        return found
+
 
 def written(before: State, after: State) -> set[str]:
     """Names of what is another tensor after than before; "cells" where cells came or went."""
