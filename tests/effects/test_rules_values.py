@@ -61,7 +61,7 @@ CASES = {
         TYPED,
         r"set to 2, but Growth\.rate has values for the cell types 0, 1\. Add 2: … to it",
     ),
-    "a type below 0": ("cell_type", -1, TYPED, r"set to -1, but Growth\.rate has values for"),
+    "a type below 0": ("cell_type", -1, TYPED, "set to -1: it must be a whole number from 0"),
     "a type without a drawn constant": (
         "cell_type",
         2,

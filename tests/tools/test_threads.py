@@ -160,7 +160,7 @@ def test_the_way_back_through_contacts_and_sums_has_one_thread(monkeypatch):
 
     rate = torch.tensor(1.0, requires_grad=True)
     cells = tf.Cells([[0.0, 0.0], [1.0, 0.9]], [[1.0, 0.0]] * 2, 2.0)
-    tight = tf.Mechanics(dim=2, tolerance=1e-5)
+    tight = tf.Mechanics(dim=2, tolerance=1e-5, backend="torch")
     model = tf.Scene(tf.Growth(rate=rate), tight, founders=cells).bind()
     state = model.step(model.step(model.start()))
     monkeypatch.setattr(adjoint, "conjugate_gradients", solving)

@@ -21,7 +21,7 @@ from torchfilm.tools.warn_once import warn
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, numbers, physical
 
 LAWS = ("volume", "length", "linear")
-MOST_GROWN = 1.001  # of its size, that a cell may add in a step where cells divide; with rounding
+MOST_GROWN = 1.05  # of its size, that a cell may add in a step where cells divide
 UNITS = {"volume": "1/h", "length": "1/h of the length", "linear": "µm/h"}
 
 
@@ -230,13 +230,8 @@ class Growth(Effect):
             relative = torch.expm1(relative)
         elongation = wanted_elongation(self.law, relative, state.length, state.radius)
         length = state.length + elongation
-        good = finite = torch.isfinite(length)
-        if doubling_matters(self.law, state):
-            if self.law == "linear":
-                relative = elongation / (state.length + state.radius * (4.0 / 3.0))
-            good = good & (relative <= MOST_GROWN)
-        if state.cells and not bool(good.all()):
-            report = _too_long(state, good, torch.where(finite, relative, math.inf))
+        report = self._too_far(state, relative, elongation, length) if state.cells else None
+        if report is not None:
             elongation = torch.where(
                 (report.status == 0).index_select(0, state.colony), elongation, 0.0
             )
@@ -245,6 +240,24 @@ class Growth(Effect):
                 state.length + elongation,
             )
         return state.replace(length=length).with_fields(elongation=elongation)
+
+    def _too_far(
+        self, state: State, relative: Tensor, elongation: Tensor, length: Tensor
+    ) -> GrowthReport | None:
+        """The report of cells that would grow too far, to these lengths (N,); None without any, by
+        one read. relative: (N,) as `wanted_elongation` has it."""
+        longest = length.max()  # NaN is the largest of all
+        if not doubling_matters(self.law, state):
+            if longest.item() < math.inf:
+                return None
+        else:
+            if self.law == "linear":
+                relative = elongation / (state.length + state.radius * (4.0 / 3.0))
+            if bool((longest < math.inf) & (relative.max() <= MOST_GROWN)):
+                return None
+        finite = torch.isfinite(length)
+        good = finite & (relative <= MOST_GROWN) if doubling_matters(self.law, state) else finite
+        return _too_long(state, good, torch.where(finite, relative, math.inf))
 
 
 class _BoundGrowth(BoundEffect):
