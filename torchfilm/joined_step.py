@@ -15,7 +15,13 @@ import torch
 
 from torchfilm.effect import BoundEffect, Effect
 from torchfilm.effects.bound_mechanics import BoundMechanics
-from torchfilm.effects.growth import MOST_GROWN, Growth, doubling_matters, wanted_elongation
+from torchfilm.effects.growth import (
+    MOST_GROWN,
+    Growth,
+    doubling_matters,
+    of_size,
+    wanted_elongation,
+)
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.state import State
 from torchfilm.tools.numba_calls import as_array
@@ -59,12 +65,11 @@ class JoinedStep:
         with np.errstate(all="ignore"):
             growth = wanted_elongation(self.law, relative, length, radius)
             after = length + growth
-            if self.law == "linear":
-                relative = growth / (length + radius * (4.0 / 3.0))
-        matters = doubling_matters(self.law, state)
-        if not after.max() < math.inf or (matters and not relative.max() <= MOST_GROWN):
-            return None
-        return growth, after
+            good = after.max() < math.inf
+            if doubling_matters(self.law, state):
+                size = of_size(self.law, relative, growth, length, radius)
+                good = good and size.max() <= MOST_GROWN
+        return (growth, after) if good else None
 
 
 def joined(effects: Sequence[Part]) -> list[Part | JoinedStep]:

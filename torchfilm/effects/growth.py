@@ -246,17 +246,15 @@ class Growth(Effect):
     ) -> GrowthReport | None:
         """The report of cells that would grow too far, to these lengths (N,); None without any, by
         one read. relative: (N,) as `wanted_elongation` has it."""
-        longest = length.max()  # NaN is the largest of all
-        if not doubling_matters(self.law, state):
-            if longest.item() < math.inf:
-                return None
-        else:
-            if self.law == "linear":
-                relative = elongation / (state.length + state.radius * (4.0 / 3.0))
-            if bool((longest < math.inf) & (relative.max() <= MOST_GROWN)):
-                return None
+        longest, most = length.max(), math.inf  # NaN is the largest of all
+        if doubling_matters(self.law, state):
+            relative = of_size(self.law, relative, elongation, state.length, state.radius)
+            most = MOST_GROWN
+            longest = torch.where(relative.max() <= most, longest, math.inf)
+        if longest.item() < math.inf:
+            return None
         finite = torch.isfinite(length)
-        good = finite & (relative <= MOST_GROWN) if doubling_matters(self.law, state) else finite
+        good = finite & (relative <= most)
         return _too_long(state, good, torch.where(finite, relative, math.inf))
 
 
@@ -335,9 +333,19 @@ def wanted_elongation(law: str, relative: Any, length: Any, radius: Any) -> Any:
     """How much longer cells become, (N,) µm, as tensors or arrays. relative: (N,) growth of what
     the law lets grow evenly; by "linear" in µm."""
     if law == "volume":
-        # V = π r² (l + 4r/3), so l + 4r/3 grows like V
-        return relative * (length + radius * (4.0 / 3.0))
+        return relative * _like_volume(length, radius)
     return relative * length if law == "length" else relative
+
+
+def of_size(law: str, relative: Any, elongation: Any, length: Any, radius: Any) -> Any:
+    """How much cells grow, (N,), relative to what the law lets grow evenly; by "linear" to their
+    volume. The rest as for `wanted_elongation`."""
+    return elongation / _like_volume(length, radius) if law == "linear" else relative
+
+
+def _like_volume(length: Any, radius: Any) -> Any:
+    """What grows as V = π r² (l + 4r/3) does, (N,) µm."""
+    return length + radius * (4.0 / 3.0)
 
 
 def _first_rate(state: State, rows: Tensor, values: Values) -> Tensor:
