@@ -112,6 +112,28 @@ def film_of(
     return Film(height, thickness, roughness, (flat > 0).double().mean(1))
 
 
+def below_top_of(
+    state: State, spacing: float, floor: float, across: Mapping[str, tuple[float, float]] | None
+) -> Tensor:
+    """See `measure.below_top`."""
+    where = Floor.of("below_top", state, spacing, floor, across)
+    height = columns_of(state, where).height()
+    place, there = state.colony, torch.ones_like(state.colony, dtype=torch.bool)
+    for k, ((low, high), step) in enumerate(zip(where.spans, where.steps, strict=True)):
+        x = state.position[:, k]
+        column, count = torch.floor((x - low) / step).long(), where.counts[k]
+        if where.periodic[k]:
+            column = column % count
+        else:
+            there &= (x >= low) & (x <= high)
+        place = place * count + column.clamp(0, count - 1)
+    above = state.position[:, -1] - floor
+    # a cell may lie beside the middle of its column and reach above all that is there
+    own = above + 0.5 * state.length * state.axis[:, -1].abs() + state.radius
+    top = torch.maximum(height.index_select(0, place), own)
+    return torch.where(there, top - above, math.nan)
+
+
 def columns_of(state: State, floor: Floor) -> Columns:
     """Where the cells of a state meet the columns of a floor, above it."""
     half, radius, axis = 0.5 * state.length.double(), state.radius.double(), state.axis.double()

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.contact_forces import bonds_of, pushed_by_cells, pushed_by_walls, softness
-from torchfilm.film_shape import Film, film_of
+from torchfilm.film_shape import Film, below_top_of, film_of
 from torchfilm.physics.nearby import gaps_nearby, pairs_within
 from torchfilm.physics.surfaces import FlatSurface
 from torchfilm.physics.walls import Wall, depth_in_walls
@@ -253,6 +253,22 @@ def film(
     """
     spacing = checks.number("film(spacing)", spacing, above=0.0)
     return film_of(state, spacing, checks.number("film(floor)", floor), across)
+
+
+@of_a_state
+@torch.no_grad()
+def below_top(
+    state: State,
+    spacing: float = 1.0,
+    *,
+    floor: float = 0.0,
+    across: Mapping[str, tuple[float, float]] | None = None,
+) -> Tensor:
+    """How far the centre of each cell lies below the top of the film above it, (N,) float64 µm:
+    the highest cell of its column, or its own upper end. NaN for cells that lie beyond `across`.
+    The parameters are those of `film`."""
+    spacing = checks.number("below_top(spacing)", spacing, above=0.0)
+    return below_top_of(state, spacing, checks.number("below_top(floor)", floor), across)
 
 
 @of_a_state

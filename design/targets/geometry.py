@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Centre = Literal["colony"] | tuple[float, float]
-ALONG = ("x", "y", "radius", "edge")
+ALONG = ("x", "y", "z", "radius", "edge", "top")
 COLOURS = ("#c2185b", "#1976d2", "#388e3c", "#f57c00", "#7b1fa2", "#5d4037")  # of the species
 
 
@@ -50,19 +50,66 @@ def half(width: float, edge_width: float) -> float:
     return 0.5 * math.tanh(width / (4 * edge_width))
 
 
+def in_words(along: str) -> str:
+    """A coordinate in a description, such as "along x"."""
+    return {"edge": "below the edge", "top": "below the top"}.get(along, f"along {along}")
+
+
+def check_along(target: str, along: str, centre: Centre, state: tf.State) -> None:
+    """Raises `tf.InputError` where the colonies of a first state have no such coordinate."""
+    if along == "z" and state.dim == 2:
+        hint = 'A film in the plane grows along "y".'
+        raise checks.input_error(f"{target}.along", along, "one that the plane has", hint)
+    if along == "top":
+        tf.measure.below_top(state)  # says what a state lacks whose film has no floor
+    axes = {"x": "x", "y": "y", "radius": "xy", "edge": "xy"}.get(along, "")
+    around = periodic_along(state, axes)
+    if around and along == "edge":
+        raise checks.input_error(
+            f"{target}.along", along, f"no edge, as space is periodic along {around}",
+            'Where a film grows from a floor, along="top" is the distance below its top.',
+        )  # fmt: skip
+    if around and centre == "colony":
+        raise checks.input_error(
+            f"{target}.centre", centre, f"(x, y) µm, as space is periodic along {around}"
+        )
+
+
+def periodic_along(state: tf.State, axes: str) -> str:
+    """Along which of these axes space is periodic, such as "x and y"; "" along none."""
+    return " and ".join(a for a in axes if state.space is not None and a in state.space.faces)
+
+
+def nearest_image(state: tf.State, apart: Tensor) -> Tensor:
+    """Differences of places along x and y, (N, 2) µm; where space is periodic, to the nearest
+    image."""
+    if state.space is None:
+        return apart
+    columns = []
+    for k, period in enumerate(state.space.period[:2]):
+        x = apart[:, k]
+        columns.append(x - period * torch.floor(x / period + 0.5) if period else x)
+    return torch.stack(columns, 1)
+
+
 def offset(state: tf.State, centre: Centre) -> Tensor:
-    """The position of each cell relative to the centre, (N, 2) float64 µm, without gradient."""
+    """The position of each cell relative to the centre, (N, 2) float64 µm, without gradient; of a
+    cell in a periodic space that of its image that is nearest to the centre."""
     place = state.position.detach()[:, :2]
     if centre == "colony":
         return place - tf.measure.colony_centre(state)[:, :2].index_select(0, state.colony)
-    return place - place.new_tensor(centre)
+    return nearest_image(state, place - place.new_tensor(centre))
 
 
 def coordinate(state: tf.State, along: str, centre: Centre) -> Tensor:
-    """The coordinate of each cell along "x", "y" or "radius", from the centre, or below the
-    "edge" of its colony, (N,) float64 µm."""
+    """The coordinate of each cell along "x", "y" or "radius", from the centre, its "z", or how far
+    it lies below the "edge" of its colony or the "top" of its film, (N,) float64 µm."""
     if along == "edge":
         return below_edge(state)
+    if along == "top":
+        return tf.measure.below_top(state)
+    if along == "z":
+        return state.position.detach()[:, 2]
     x, y = offset(state, centre).unbind(1)
     return x if along == "x" else y if along == "y" else (x * x + y * y).sqrt()
 
@@ -111,8 +158,27 @@ def draw_edges(
     colour: str,
     style: str = "--",
 ) -> None:
-    """Draw edges along a coordinate in the picture of the colony at `place` of the batch."""
+    """Draw edges along a coordinate in the picture of the colony at `place` of the batch, if they
+    can be seen there: a picture of a colony in space shows it from above."""
     if along == "edge":
         draw_below_edge(ax, state, place, tuple(edges), colour, style)
-    else:
+    elif along == "top" and state.dim == 2:
+        draw_below_top(ax, state, place, edges, colour, style)
+    elif along not in ("z", "top"):
         lines(ax, along, centre_at(state, centre, place), edges, colour, style)
+
+
+def draw_below_top(
+    ax: Axes, state: tf.State, place: int, depths: Sequence[float], colour: str, style: str
+) -> None:
+    """Draw the lines at some depths, µm, below the top of the film of the colony at `place` of the
+    batch, and keep the limits of the axes."""
+    window = ax.get_xlim(), ax.get_ylim()
+    mine = state.colony == place
+    x, y = state.position[mine, :2].T
+    top = y + tf.measure.below_top(state)[mine]
+    order = torch.argsort(x)
+    for depth in (d for d in depths if math.isfinite(d)):
+        line = x[order].cpu().numpy(), (top - depth)[order].cpu().numpy()
+        ax.plot(*line, color=colour, linestyle=style, linewidth=1.0, zorder=3)
+    ax.set(xlim=window[0], ylim=window[1])

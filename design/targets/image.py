@@ -17,6 +17,7 @@ from design.targets.geometry import (
     COLOURS,
     Centre,
     centre_at,
+    check_along,
     check_profile,
     checked_centre,
     offset,
@@ -99,6 +100,10 @@ class Image(ProfileTarget):
     @property
     def names(self) -> tuple[str, ...]:
         return (self.species,)
+
+    def check(self, state: tf.State) -> None:
+        super().check(state)
+        check_along("Image", "radius", self.centre, state)
 
     @cached_property
     def pixels(self) -> np.ndarray:

@@ -271,7 +271,7 @@ class Observed(Target):
         return replace(self, values=of(self.values), spread=of(self.spread), plan=plan)
 
     def check(self, state: tf.State) -> None:
-        require(state, self.plan.species)
+        self.plan.check(state)
 
     def unfit(self, state: tf.State) -> list[str]:
         if self.time is None or abs(state.time - self.time) <= 1e-6 * self.time:

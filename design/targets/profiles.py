@@ -32,11 +32,13 @@ from design.targets.geometry import (
     Centre,
     between,
     centre_at,
+    check_along,
     check_profile,
     checked_centre,
     coordinate,
     draw_edges,
     half,
+    in_words,
     lines,
 )
 from torchfilm import checks
@@ -183,10 +185,12 @@ class Bands(ProfileTarget):
     edges[k] and edges[k + 1].
 
     edges: ascending, µm from `centre`, one more than species; the first may be −inf and the last
-    inf. along: "x", "y", "radius", or "edge", the distance below the colony's own edge, an ellipse
-    that moves outwards as it grows. centre: (x, y) µm, or "colony" for the centre of the colony.
-    floor: the level from which a cell counts as lit. edge_width: µm; an edge is a logistic that
-    rises from 0.27 to 0.73 between one width before it and one width behind it.
+    inf. along: "x", "y", "radius"; "z", the height in space; "edge", the distance below the
+    colony's own edge, an ellipse that moves outwards as it grows; or "top", the distance below the
+    top of a film that grows from a floor at 0 (`tf.measure.below_top`). centre: (x, y) µm, or
+    "colony" for the centre of the colony. floor: the level from which a cell counts as lit.
+    edge_width: µm; an edge is a logistic that rises from 0.27 to 0.73 between one width before it
+    and one width behind it.
     """
 
     species: tuple[str, ...]
@@ -222,6 +226,10 @@ class Bands(ProfileTarget):
     def names(self) -> tuple[str, ...]:
         return self.species
 
+    def check(self, state: tf.State) -> None:
+        super().check(state)
+        check_along("Bands", self.along, self.centre, state)
+
     @property
     def least(self) -> float:
         return half(min(b - a for a, b in itertools.pairwise(self.edges)), self.edge_width)
@@ -248,7 +256,7 @@ class Bands(ProfileTarget):
             f"{s} from {a:g} to {b:g}"
             for s, a, b in zip(self.species, self.edges, self.edges[1:], strict=False)
         ]
-        return f"bands along {self.along}, µm: " + ", ".join(parts)
+        return f"bands {in_words(self.along)}, µm: " + ", ".join(parts)
 
 
 @dataclass(frozen=True)
@@ -285,6 +293,10 @@ class Ring(ProfileTarget):
     @property
     def names(self) -> tuple[str, ...]:
         return (self.species,)
+
+    def check(self, state: tf.State) -> None:
+        super().check(state)
+        check_along("Ring", "radius", self.centre, state)
 
     @property
     def edges(self) -> tuple[float, float]:
@@ -336,7 +348,7 @@ class Ring(ProfileTarget):
 @dataclass(frozen=True)
 class Gradient(ProfileTarget):
     """A gradient: the target level falls linearly from 1 at `low` to 0 at `high`, µm from `centre`
-    along "x", "y", "radius" or "edge", as for `Bands`. It is constant beyond them.
+    along one of the coordinates of `Bands`. It is constant beyond them.
 
     With low > high it rises. centre, floor: as for `Bands`.
     """
@@ -366,6 +378,10 @@ class Gradient(ProfileTarget):
     def names(self) -> tuple[str, ...]:
         return (self.species,)
 
+    def check(self, state: tf.State) -> None:
+        super().check(state)
+        check_along("Gradient", self.along, self.centre, state)
+
     def target_profile(self, state: tf.State) -> Tensor:
         x = coordinate(state, self.along, self.centre)
         return ((self.high - x) / (self.high - self.low)).clamp(0.0, 1.0).unsqueeze(1)
@@ -374,11 +390,8 @@ class Gradient(ProfileTarget):
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         """Those of every profile, and `correlation`, (B,), of level and target level, from −1 to
         1."""
-        y, m, w = (
-            valid_levels(state, self.names)[0][:, 0],
-            self.target_profile(state)[:, 0],
-            weights(state),
-        )
+        y, w = valid_levels(state, self.names)[0][:, 0], weights(state)
+        m = self.target_profile(state)[:, 0]
         means = total(state, torch.stack([w, w * y, w * m], 1))
         mean = (means[:, 1:] / means[:, :1]).index_select(0, state.colony)
         dy, dm = y - mean[:, 0], m - mean[:, 1]
@@ -402,6 +415,6 @@ class Gradient(ProfileTarget):
 
     def describe(self) -> str:
         return (
-            f"{self.species} in a gradient along {self.along} from 1 at {self.low:g} µm to 0 at"
+            f"{self.species} in a gradient {in_words(self.along)} from 1 at {self.low:g} µm to 0 at"
             f" {self.high:g} µm"
         )

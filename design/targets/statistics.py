@@ -13,12 +13,15 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import levels, ratio
+from design.targets.base import levels, ratio, require
+from design.targets.geometry import periodic_along
 from torchfilm import checks
 
 LOG_CELLS = "log_cells"
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 RESAMPLED = 200  # bootstrapped colonies
+# the last words of the groups of statistics that distances between cells enter
+OF_PLACES = ("extent", "density", "alignment", "profile", "neighbours")
 INNER = 0.95  # share of the cells within the outermost ring
 STEADY = 1e-12  # variance, in squares of the mean, that rounding can cause
 
@@ -93,6 +96,18 @@ class ColonyStatistics:
                 found[f"{name} neighbours"] = (f"{name}_neighbours",)
             found[f"{name} variation"] = (f"{name}_cv",)
         return found
+
+    def check(self, state: tf.State) -> None:
+        """Raises `tf.InputError` where colonies like those of a state have no such statistics."""
+        require(state, self.species)
+        around = periodic_along(state, "xy")
+        of_places = [g for g in self.groups if g.split()[-1] in OF_PLACES]
+        if around and of_places:
+            raise tf.InputError(
+                f"Observed compares places ({', '.join(of_places)}), and in this scene space is"
+                f" periodic along {around}. Leave them out:"
+                f" .without({', '.join(map(repr, of_places))})."
+            )
 
     @property
     def names(self) -> tuple[str, ...]:

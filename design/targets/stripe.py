@@ -13,7 +13,16 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import contrast, ratio, species_name, total, valid_levels, weights
-from design.targets.geometry import COLOURS, between, check_profile, half, lines
+from design.targets.border import border, from_border, on_axis
+from design.targets.geometry import (
+    COLOURS,
+    between,
+    check_profile,
+    half,
+    lines,
+    offset,
+    periodic_along,
+)
 from design.targets.profiles import ProfileTarget
 from torchfilm import checks
 
@@ -21,9 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 STRIP = 1.0  # µm: width of the strips of the profile along the stripe's axis, that of a cell
-TOUCHING = 1e-9  # µm: the least distance between cells of two types, also where they overlap
 ACROSS = 4.0  # µm: width of the strips across, in which the middle of the stripe is located
-BLOCK = 2048  # cells whose distances to all others are in memory at once
 FEWEST = 3  # cells: the least number for the mean of a strip
 
 
@@ -83,6 +90,10 @@ class Stripe(ProfileTarget):
         super().check(state)
         if self.at != "border" and self.cell_type is None:
             return
+        if self.at == "border" and periodic_along(state, self.along):
+            hint = "Give at= a place in µm."
+            rule = f"a place, as space is periodic along {self.along}: borders come in pairs"
+            raise checks.input_error("Stripe.at", self.at, rule, hint)
         if "cell_type" not in state.fields:
             raise tf.InputError(
                 "Stripe: the cells have no types. Give types to the founders:"
@@ -138,7 +149,8 @@ class Stripe(ProfileTarget):
             at = torch.full(
                 (state.colonies,), float(self.at), dtype=torch.float64, device=state.device
             )
-            return at, torch.full_like(at, place), _axis(state, self.along) - self.at
+            away = offset(state, (float(self.at),) * 2)[:, "xy".index(self.along)]
+            return at, torch.full_like(at, place), away
         at, low_type = border(state, self.along)
         middle = torch.full_like(at, place)
         if self.place is None and self.cell_type is not None:
@@ -149,9 +161,9 @@ class Stripe(ProfileTarget):
             at,
             middle,
             (
-                _from_border(state, low_type)
+                from_border(state, low_type)
                 if self.winds
-                else _axis(state, self.along) - at.index_select(0, state.colony)
+                else on_axis(state, self.along) - at.index_select(0, state.colony)
             ),
         )
 
@@ -190,8 +202,8 @@ class Stripe(ProfileTarget):
         columns = (
             state.colony,
             x,
-            _axis(state, self.along),
-            _axis(state, "y" if self.along == "x" else "x"),
+            on_axis(state, self.along),
+            on_axis(state, "y" if self.along == "x" else "x"),
             y,
             w,
         )
@@ -256,11 +268,6 @@ class Stripe(ProfileTarget):
         return f"{self.species} in a stripe {self.width:g} µm wide at {at}{place}{whose}"
 
 
-def _axis(state: tf.State, along: str) -> Tensor:
-    """The coordinate of each cell along x or y, (N,) float64 µm, without gradient."""
-    return state.position.detach()[:, "xy".index(along)].double()
-
-
 def _types(state: tf.State) -> list[list[int]]:
     """The types of cells that are in each colony, ascending."""
     pairs = torch.unique(torch.stack([state.colony, state.cell_type], 1), dim=0)
@@ -268,68 +275,6 @@ def _types(state: tf.State) -> list[list[int]]:
     for colony, kind in pairs.tolist():
         found[colony].append(kind)
     return found
-
-
-@torch.no_grad()
-def _from_border(state: tf.State, low_type: Tensor) -> Tensor:
-    """The distance of each cell to the nearest cell of the other type, (N,) float64 µm: seen from
-    above, centre to centre less a diameter. It is negative for `low_type` (B,), the type that lies
-    lower on the axis, and NaN where there is no other type."""
-    position, kind = state.position.detach()[:, :2], state.cell_type
-    found = torch.full((state.cells,), math.nan, dtype=torch.float64, device=state.device)
-    of_one = kind == (-state.groups.max(-kind)).index_select(0, state.colony)
-    # the cells of each colony, those of its first type first
-    order = torch.argsort(2 * state.colony + (~of_one).long(), stable=True)
-    firsts = state.groups.sum(of_one.double().unsqueeze(1)).squeeze(1).long()
-    sizes = torch.stack([firsts, state.counts - firsts], 1)
-    parts = order.split(sizes.flatten().tolist())  # the one read
-    for one, other in zip(parts[::2], parts[1::2], strict=True):
-        if not other.numel():
-            continue
-        for these, those in ((one, other), (other, one)):
-            for some in these.split(BLOCK):
-                found[some] = torch.cdist(
-                    position[some], position[those], compute_mode="donot_use_mm_for_euclid_dist"
-                ).amin(1)
-    found = (found - 2.0 * state.radius.detach().double()).clamp(min=TOUCHING)
-    return torch.where(kind == low_type.index_select(0, state.colony), -found, found)
-
-
-@torch.no_grad()
-def border(state: tf.State, along: str = "x") -> tuple[Tensor, Tensor]:
-    """The border of the two types of cells of each colony, (B,) float64 µm, and the type that lies
-    before it, (B,) int64.
-
-    It is the place along x or y with the fewest cells on the wrong side, half-way between two cells
-    (the first of several such places). The type with the lower mean place belongs before it. NaN
-    where a colony has one type only; of more than two types, the lowest and the highest number
-    count.
-    """
-    groups, colony, x = state.groups, state.colony, _axis(state, along)
-    if not state.cells:
-        return x.new_full((state.colonies,), math.nan), colony.new_zeros(state.colonies)
-    one, other = -groups.max(-state.cell_type), groups.max(state.cell_type)
-    is_one, is_other = (state.cell_type == t.index_select(0, colony) for t in (one, other))
-    sums = groups.sum(
-        torch.stack([is_one * x, is_one.double(), is_other * x, is_other.double()], 1)
-    )
-    straight = sums[:, 0] * sums[:, 3] <= sums[:, 2] * sums[:, 1]
-    before = torch.where(straight, one, other)
-    # cells on the wrong side for a border after each cell, less those for a border before all cells
-    order = torch.argsort(x, stable=True)
-    order = order.index_select(0, torch.argsort(colony.index_select(0, order), stable=True))
-    step = (is_other.long() - is_one.long()) * torch.where(straight, 1, -1).index_select(0, colony)
-    wrong = torch.cumsum(step.index_select(0, order), 0)
-    least = (-groups.max(-wrong)).index_select(0, colony)
-    row = torch.arange(state.cells, device=state.device)
-    first = -groups.max(torch.where(wrong == least, -row, -state.cells))
-    last = groups.max(row)
-    x = x.index_select(0, order)
-    place = 0.5 * (
-        x.index_select(0, first.clamp(max=state.cells - 1))
-        + x.index_select(0, torch.minimum(first + 1, last))
-    )
-    return torch.where((state.counts > 0) & (one < other), place, math.nan), before
 
 
 def profile(

@@ -37,6 +37,23 @@ def test_small_species_are_told_once_and_not_for_each_design():
     assert len(small) == 2  # as the search is made, and as it runs
 
 
+def makes_when_starved(u, s, p, cell):
+    return {"m": 20.0 * tf.kinetics.repression(s.food, p.k, 4) - u.m}
+
+
+def test_species_that_a_signal_represses_at_first_are_not_small():
+    """At first 20 · (k/s)⁴ = 2e-11; without food they make 20 an hour."""
+    for k in (1e-3, 1e-14):
+        scene = tf.Scene(
+            tf.Circuit(makes_when_starved, species="m", k=k),
+            tf.Medium(food=tf.Signal(diffusion=9.0, initial=1.0), box=((-9, -9), (9, 9)), spacing=3),
+            founders=tf.inoculum(4, radius=5.0, seed=1), dt=0.05,
+        )  # fmt: skip
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            scene.bind(1).start()
+
+
 def leaves(rate=1.0) -> tf.Scene:
     """Cells that grow out of their box: no colony comes to its end."""
     return tf.Scene(

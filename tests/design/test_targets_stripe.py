@@ -12,7 +12,7 @@ from patterned import SHARP, crowded, placed, row
 
 import torchfilm as tf
 from design.targets import Stripe
-from design.targets.stripe import border
+from design.targets.border import border
 
 
 def field(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from torchfilm.tools.warn_once import warn
 # Species are too small for `atol` where it is more than this part of them.
 SMALL = 1e-3
 ATOL = 1e-9  # the default; a larger one has been chosen
+FALLEN = (0.1, 0.01, 0.0)  # parts of the signals at first, with which species are judged, too
 
 
 def try_circuit(
@@ -68,7 +70,7 @@ def try_circuit(
                     f" ({at}): every rate must be a finite number."
                 )
     if atol is not None:
-        _check_size(circuit.label, [concentrations, *inside.values()], atol)
+        _check_size(circuit, concentrations, inside, atol)
     if isinstance(circuit.part, Network):
         exchanged = {
             n.removeprefix("out.")
@@ -95,14 +97,23 @@ def _check_alone(
             )
 
 
-def _check_size(label: str, numbers: Sequence[Tensor], atol: float) -> None:
+def _check_size(
+    circuit: CircuitCells, concentrations: Tensor, inside: Mapping[str, Tensor], atol: float
+) -> None:
     """Warn where species are so small, at first and by what an hour makes, that their errors count
     as nothing."""
-    size = max(float(x.detach().abs().max()) for x in numbers if x.numel())
-    if 0 < SMALL * size < atol <= ATOL:
+    largest = lambda found: max(float(x.detach().abs().max()) for x in found if x.numel())
+    small = lambda size: 0 < SMALL * size < atol <= ATOL
+    size = largest([concentrations, *inside.values()])
+    # a signal may repress at first, and less where cells have taken it up
+    for part in FALLEN if small(size) and circuit.signals else ():
+        around = {name: part * value for name, value in circuit.signals.items()}
+        fallen, _ = replace(circuit, signals=around).changes(concentrations, circuit.rows)
+        size = max(size, largest(fallen.values()))
+    if small(size):
         warn(
-            f"{label}: its species are of about {size:.0e}, and errors below Circuit.atol ="
+            f"{circuit.label}: its species are of about {size:.0e}, and errors below Circuit.atol ="
             f" {atol:.0e} count as none. Give atol={1e-3 * SMALL * size:.0e}, or concentrations in"
             " a smaller unit, such as nM in place of M.",
-            of=f"{label}: small species",
+            of=f"{circuit.label}: small species",
         )
