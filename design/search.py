@@ -122,7 +122,7 @@ class Search(TaskOptions):
         return f"{chosen.describe()} ({chosen.why})" if chosen and chosen.why else ""
 
     @checks.known_keywords
-    @checks.once()
+    @checks.once({checks.SMALL_SPECIES})  # said of the first design, as the search is made
     def run(
         self,
         colonies: int,

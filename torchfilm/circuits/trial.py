@@ -13,7 +13,7 @@ from torchfilm.circuits.network import Network
 from torchfilm.circuits.run import CircuitCells
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
-from torchfilm.tools.warn_once import warn
+from torchfilm.tools.warn_once import SMALL_SPECIES, warn
 
 # Species are too small for `atol` where it is more than this part of them.
 SMALL = 1e-3
@@ -115,5 +115,5 @@ def _check_size(
             f"{circuit.label}: its species are of about {size:.0e}, and errors below Circuit.atol ="
             f" {atol:.0e} count as none. Give atol={1e-3 * SMALL * size:.0e}, or concentrations in"
             " a smaller unit, such as nM in place of M.",
-            of=f"{circuit.label}: small species",
+            of=SMALL_SPECIES,
         )

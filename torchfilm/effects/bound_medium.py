@@ -236,9 +236,16 @@ class GridCoverage(_MediumPart):
         self._seen: ref[Grid] | None = None  # the grid that was checked last
 
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
-        """Warn where the box would grow through a wall."""
+        """Warn where the box would grow through a wall, or into a medium that is not known."""
         if self.effect.outside != "grow":
             return
+        if any(getattr(e, "acts_without_cells", False) for e in effects):
+            warn(
+                "Medium(outside='grow'): new voxels have their first concentrations, though"
+                " MediumReactions change those from the start also where no cell is. Begin with"
+                " concentrations at which nothing reacts, or give a box that has room for the"
+                " colony, with outside='error'."
+            )
         surfaces = [s for e in effects for s in e.effect.wall_surfaces()]
         walls: dict[str, float] = {}
         low, high = (~self.fixed & ~self.flat).tolist()
@@ -273,7 +280,7 @@ class GridCoverage(_MediumPart):
         return self.transport.lay(state)
 
     def ready(self, state: State) -> State:
-        return self._grown(state) if self.effect.outside == "grow" else state
+        return self._grown(state, 0.0) if self.effect.outside == "grow" else state
 
     def opened(self, state: State) -> State:
         layout = state.layout
@@ -310,7 +317,7 @@ class GridCoverage(_MediumPart):
 
     def step(self, state: State, dt: float) -> State:
         if self.effect.outside == "grow":
-            state = self._grown(state)
+            state = self._grown(state, dt)
         return self._looked(state)
 
     def numerics(self, dt: float, state: State) -> list[str]:
@@ -332,7 +339,7 @@ class GridCoverage(_MediumPart):
         fixed_low, fixed_high = self.fixed
         return low.masked_fill(fixed_low, torch.inf), high.masked_fill(fixed_high, -torch.inf)
 
-    def _grown(self, state: State) -> State:
+    def _grown(self, state: State, dt: float) -> State:
         layout = state.layout
         assert layout is not None
         low, high = self._span(state)
@@ -355,7 +362,7 @@ class GridCoverage(_MediumPart):
             return state
         state = state.replace(layout=layout.on(grid))
         old = values.pop() > 0
-        first = [self.transport.values(name, "initial", state) for name in self.effect.signals]
+        first = [self.transport.without_cells(name, state, dt) for name in self.effect.signals]
         return state.with_fields(
             **{
                 n: torch.where(old, v, start)

@@ -143,6 +143,7 @@ class BoundReactions(BoundEffect):
 
     effect: MediumReactions
     first: BoundReactions | None = None  # the other half, which was traced before
+    acts_without_cells = False  # whether the medium changes from the start
 
     def __init__(self, effect: MediumReactions, binding: Binding):
         super().__init__(effect, binding)
@@ -201,7 +202,19 @@ class BoundReactions(BoundEffect):
                         f"MediumReactions.backend = 'compiled', but {self.by_torch}. Leave backend"
                         " out."
                     ) from why
+        self.acts_without_cells = self._acts(state)
         return state
+
+    @torch.no_grad()
+    def _acts(self, state: State) -> bool:
+        """Whether a signal changes at its first concentrations, in some voxels of all colonies."""
+        count = self._nodes(state)
+        rows = torch.arange(count, device=state.device)[:: max(1, count // TRIED)]
+        first = torch.stack(
+            [state.fields[OUTSIDE + n].index_select(0, rows) for n in self.species], 1
+        )
+        changes, _ = self._voxels(state, None).changes(first, rows)
+        return any(bool((rate != 0).any()) for rate in changes.values())
 
     def _listed(self, reactions: Sequence[Reaction], signals: Sequence[str]) -> None:
         used = {n for r in reactions for n in (*r.consumes, *r.produces)}

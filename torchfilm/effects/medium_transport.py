@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import Binding
+from torchfilm.effects.medium_values import on_grid, without_cells
 from torchfilm.resolver import snapshot
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.grid import Grid, GridBatch
@@ -28,10 +29,11 @@ from torchfilm.state import OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import why_torch
 from torchfilm.tools.tangents import tracked
+from torchfilm.values import numbers
 
 if TYPE_CHECKING:
     from torchfilm.effects.medium import Medium
-    from torchfilm.effects.signal import Flow, OnGrid, Signal
+    from torchfilm.effects.signal import Flow, Signal
 
 # Methods that are exact over a step, whatever its length.
 EXACT = ("exponential", "series")
@@ -94,6 +96,7 @@ class Transport:
         self.schedules = schedules(self._given)
         # those that transport of each signal depends on; a reservoir is none of it
         self._moving = {n: schedules((x.source, flows[n], boundary[n])) for n, x in signals.items()}
+        self.corner = medium.corners[0]
         self._known: dict[tuple[int, ...], Constants] = {}
         # signals that take turns with circuits, in the medium's steps; that others move, by whom
         self.in_turns: frozenset[str] = frozenset()
@@ -133,11 +136,20 @@ class Transport:
 
     def first(self, name: str) -> Callable[[State, Tensor], Tensor]:
         """The first values of a signal, as a field's `initial`."""
-        return partial(_first_values, self.at(0.0).signals[name], name)
+        return partial(_first_values, self, name)
 
     def values(self, name: str, what: str, state: State) -> Tensor:
         """The initial, source or decay of a signal on every voxel, (nodes,); 0 in obstacles."""
-        return _on_grid(self.at(state.time).signals[name], name, what, state)
+        return on_grid(self.at(state.time).signals[name], name, what, state, self.corner)
+
+    def without_cells(self, name: str, state: State, dt: float) -> Tensor:
+        """What a signal has become on every voxel as cells are about to find it in a step of dt
+        hours, (nodes,), where neither cells nor transport acted on it; 0 in obstacles."""
+        mover = self.coupled.get(name)  # nutrition has moved it over the step, circuits will
+        turns = self.medium.steps if name in self.in_turns else 1
+        half = 0.5 * dt / turns if self.medium.halves else 0.0
+        time = state.time + {"nutrition": dt, "circuits": 0.0, None: half}[mover]
+        return without_cells(self._given[0][name], name, state, self.corner, time)
 
     def carried(
         self,
@@ -234,6 +246,7 @@ class Transport:
         """Raise InputError for a signal whose rates or method cannot be."""
         assert state.layout is not None
         self._check_range(name, state.dtype)
+        self._check_fixed(name, state)
         for time in sorted({state.time, *(t for x in self.schedules for t in x.times)}):
             then, first = state.replace(time=time), state.layout.grid.batches[0]
             check_method(self._operator(name, then, first), self.medium.method)
@@ -246,13 +259,32 @@ class Transport:
         for what, value in given:
             if callable(value):
                 continue
-            greatest = float(torch.as_tensor(value, dtype=torch.float64).detach().max())
+            greatest = float(numbers(value).max())
             if greatest > most:
                 raise checks.input_error(
                     f"{what} of the signal {name!r}",
                     greatest,
                     f"at most {most:.2g} with {str(dtype)[6:]}",
                     "Choose another unit of concentration, or dtype=torch.float64.",
+                )
+
+    def _check_fixed(self, name: str, state: State) -> None:
+        """Raise InputError for a function of positions that draws random numbers."""
+        for what in ("initial", "source", "decay"):
+            if not callable(getattr(self.at(state.time).signals[name], what)):
+                continue
+            one, again = (self.values(name, what, state).detach() for _ in range(2))
+            if not torch.equal(one, again):
+                hint = (
+                    "Give a distribution, such as tf.Normal(1.0, 0.1): each voxel draws by the"
+                    " seed of the run."
+                    if what == "initial"
+                    else "Draw once, outside the function."
+                )
+                raise checks.InputError(
+                    f"{what}(positions) of the signal {name!r} gives other values each time it is"
+                    f" called. A run must not depend on random numbers that its seed does not set."
+                    f" {hint}"
                 )
 
     def _prepare(
@@ -340,53 +372,6 @@ def held_tensors(function: Callable[..., Any]) -> list[Tensor]:
     return [cell.cell_contents for cell in cells if isinstance(cell.cell_contents, Tensor)]
 
 
-def _first_values(signal: Signal, name: str, state: State, rows: Tensor) -> Tensor:
-    return _on_grid(signal, name, "initial", state).index_select(0, rows)
-
-
-def _on_grid(signal: Signal, name: str, what: str, state: State) -> Tensor:
-    """The initial, source or decay of a signal on every voxel, (nodes,); 0 in obstacles."""
-    given: OnGrid = getattr(signal, what)
-    layout = state.layout
-    assert layout is not None
-    if callable(given):
-        label = f"{what}(positions) of the signal {name!r}"
-        try:
-            found = given(layout.grid.centres())
-        except TypeError as error:
-            raise checks.InputError(
-                f"{label} cannot be called: {error}. It takes positions (nodes, 3), µm, alone. What"
-                " changes in time is a tf.Schedule of functions."
-            ) from error
-        if not isinstance(found, Tensor) or found.shape != (layout.grid.nodes,):
-            shown = tuple(found.shape) if isinstance(found, Tensor) else found
-            raise checks.input_error(
-                label,
-                shown,
-                f"a tensor of shape ({layout.grid.nodes},), one number for each position",
-            )
-        bad = torch.nonzero(~((found >= 0) & (found < torch.inf))).squeeze(1)
-        if bad.numel():
-            where = [round(x, 3) for x in layout.grid.centres()[bad[0]].tolist()]
-            raise checks.input_error(
-                label,
-                float(found[bad[0]]),
-                "finite and at least 0 everywhere",
-                f"It is not at {where} µm and {bad.numel() - 1} more positions.",
-            )
-        value = found.to(dtype=state.dtype, device=state.device)
-        if not bool(torch.isfinite(value).all()):
-            most = f"at most {torch.finfo(state.dtype).max:.2g} with {str(state.dtype)[6:]}"
-            raise checks.input_error(label, float(found.max()), most)
-    else:
-        value = _of_colonies(given, state).expand(state.colonies).index_select(0, layout.grid.owner)
-    return value if layout.mask is None else value * layout.mask
-
-
-def _of_colonies(given: float | Tensor, state: State) -> Tensor:
-    """A value as a (B,) or 0-dim tensor of the state's dtype; one value per colony is taken by
-    colony id."""
-    if not isinstance(given, Tensor):
-        return torch.tensor(given, dtype=state.dtype, device=state.device)
-    value = given.to(dtype=state.dtype, device=state.device)
-    return value if value.dim() == 0 else value.index_select(0, state.colony_id)
+def _first_values(transport: Transport, name: str, state: State, rows: Tensor) -> Tensor:
+    signal = transport.at(0.0).signals[name]
+    return on_grid(signal, name, "initial", state, transport.corner).index_select(0, rows)

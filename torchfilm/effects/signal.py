@@ -13,7 +13,7 @@ from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.schedule import Schedule, checked_values
 from torchfilm.signals.space import checked_flow
 from torchfilm.tools import checks
-from torchfilm.values import PerColony, Rule, checked
+from torchfilm.values import Distribution, PerColony, Rule, checked
 
 # A value on the grid: a number, one per colony, or a function from positions (M, 3) µm to (M,).
 OnGrid = float | Tensor | Callable[[Tensor], Tensor]
@@ -28,16 +28,17 @@ class Signal(metaclass=checks.KnownKeywords):
 
     diffusion: K, µm²/h, one number or one per colony. decay: 1/h. initial: concentration at the
     start. source: production, concentration/h. Each of these three is one number, one per colony,
-    or a function from positions (M, 3) µm to (M,). boundary, flow: faces of the box, and velocity,
-    µm/h, if they differ from the medium's. reservoir: the concentration outside an open box, one
-    number or one per colony.
+    or a function from positions (M, 3) µm to (M,). initial may be a distribution, too, such as
+    `tf.Normal(1.0, 0.1)`: each voxel draws its own, by the seed. boundary, flow: faces of the box,
+    and velocity, µm/h, if they differ from the medium's. reservoir: the concentration outside an
+    open box, one number or one per colony.
 
     source, flow and reservoir, and what the faces are given, may be a `Schedule`.
     """
 
     diffusion: float | Tensor
     decay: OnGrid = 0.0
-    initial: OnGrid = 0.0
+    initial: OnGrid | Distribution = 0.0
     source: OnGrid | Schedule = 0.0
     boundary: BoundaryConditions | None = None
     flow: Flow | Schedule = None
@@ -53,7 +54,7 @@ class Signal(metaclass=checks.KnownKeywords):
         given = {
             "diffusion": _number("Signal.diffusion", self.diffusion),
             "decay": _on_grid("Signal.decay", self.decay),
-            "initial": _on_grid("Signal.initial", self.initial),
+            "initial": _initial("Signal.initial", self.initial),
             "source": checked_values("Signal.source", self.source, _on_grid),
             "reservoir": checked_values("Signal.reservoir", self.reservoir, _number),
             "flow": velocity("Signal.flow", self.flow),
@@ -66,6 +67,16 @@ def _number(name: str, given: Any) -> Any:
     """One number, or one per colony, at least 0."""
     made = checked(name, given, Rule(scope="colony", least=0.0))
     return made.values if isinstance(made, PerColony) else made
+
+
+def _initial(name: str, given: Any) -> OnGrid:
+    """As `_on_grid`, or a distribution from which each voxel draws."""
+    if not isinstance(given, Distribution):
+        return _on_grid(name, given)
+    if given.inherited:
+        rule = "drawn for each voxel: leave inherited out"
+        raise checks.input_error(name, given, rule)
+    return checked(name, given, Rule(least=0.0))
 
 
 def _on_grid(name: str, given: Any) -> OnGrid:

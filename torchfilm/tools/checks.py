@@ -16,7 +16,8 @@ from typing import Any, TypeVar, cast
 import torch
 from torch import Tensor
 
-from torchfilm.tools.warn_once import once as once  # public, for searches
+from torchfilm.tools.warn_once import SMALL_SPECIES as SMALL_SPECIES  # public, for searches
+from torchfilm.tools.warn_once import once as once
 
 Number = float | int
 F = TypeVar("F", bound=Callable[..., Any])

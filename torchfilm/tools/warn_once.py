@@ -10,6 +10,8 @@ from contextvars import ContextVar
 
 # Modules between a user's line and a warning: torch runs steps again for a gradient.
 WITHIN = ("torchfilm", "design", "torch", "contextlib")
+# What a warning is about that says nothing of the designs of a search: some make next to nothing.
+SMALL_SPECIES = "small species"
 # What has been said so far; None outside `once`. A context variable, so that threads do not silence
 # each other.
 _SAID: ContextVar[set[str] | None] = ContextVar("said", default=None)

@@ -1,0 +1,157 @@
+"""The values of a signal on the voxels of a state: given, drawn, and what they become where no cell
+is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from torchfilm.signals.schedule import Schedule
+from torchfilm.state import State
+from torchfilm.tools import checks, random
+from torchfilm.values import Distribution
+
+if TYPE_CHECKING:
+    from torchfilm.effects.signal import OnGrid, Signal
+
+Corner = Sequence[float]
+BITS = 21  # of the number of a voxel along an axis, in its key
+
+
+def on_grid(signal: Signal, name: str, what: str, state: State, corner: Corner) -> Tensor:
+    """The initial, source or decay of a signal on every voxel, (nodes,); 0 in obstacles. corner: of
+    the medium's box, from which voxels are counted where their values are drawn."""
+    given: OnGrid = getattr(signal, what)
+    layout = state.layout
+    assert layout is not None
+    if isinstance(given, Distribution):
+        value = _drawn(given, name, what, state, corner)
+    elif callable(given):
+        label = f"{what}(positions) of the signal {name!r}"
+        try:
+            found = given(layout.grid.centres())
+        except TypeError as error:
+            raise checks.InputError(
+                f"{label} cannot be called: {error}. It takes positions (nodes, 3), µm, alone. What"
+                " changes in time is a tf.Schedule of functions."
+            ) from error
+        if not isinstance(found, Tensor) or found.shape != (layout.grid.nodes,):
+            shown = tuple(found.shape) if isinstance(found, Tensor) else found
+            raise checks.input_error(
+                label,
+                shown,
+                f"a tensor of shape ({layout.grid.nodes},), one number for each position",
+            )
+        bad = torch.nonzero(~((found >= 0) & (found < torch.inf))).squeeze(1)
+        if bad.numel():
+            where = [round(x, 3) for x in layout.grid.centres()[bad[0]].tolist()]
+            raise checks.input_error(
+                label,
+                float(found[bad[0]]),
+                "finite and at least 0 everywhere",
+                f"It is not at {where} µm and {bad.numel() - 1} more positions.",
+            )
+        value = found.to(dtype=state.dtype, device=state.device)
+        if not bool(torch.isfinite(value).all()):
+            most = f"at most {torch.finfo(state.dtype).max:.2g} with {str(state.dtype)[6:]}"
+            raise checks.input_error(label, float(found.max()), most)
+    else:
+        value = _of_colonies(given, state).expand(state.colonies).index_select(0, layout.grid.owner)
+    return value if layout.mask is None else value * layout.mask
+
+
+def _of_colonies(given: float | Tensor, state: State) -> Tensor:
+    """A value as a (B,) or 0-dim tensor of the state's dtype; one value per colony is taken by
+    colony id."""
+    if not isinstance(given, Tensor):
+        return torch.tensor(given, dtype=state.dtype, device=state.device)
+    value = given.to(dtype=state.dtype, device=state.device)
+    return value if value.dim() == 0 else value.index_select(0, state.colony_id)
+
+
+@dataclass(frozen=True, eq=False)
+class _Voxels:
+    """The voxels of a state in place of its cells, for a distribution that draws for them. Those of
+    a grid that grows keep their draws: they are counted from a corner of the medium's box."""
+
+    state: State
+    corner: Corner
+
+    def uniform(self, rows: Tensor, purpose: str) -> Tensor:
+        """As `State.uniform`."""
+        return self._law(random.uniform, rows, purpose)
+
+    def normal(self, rows: Tensor, purpose: str) -> Tensor:
+        """As `State.normal`."""
+        return self._law(random.normal, rows, purpose)
+
+    def _law(self, law: Any, rows: Tensor, purpose: str) -> Tensor:
+        assert self.state.layout is not None
+        grid = self.state.layout.grid
+        first = grid.centres().new_tensor([*self.corner])
+        place = torch.floor((grid.centres() - first) / grid.step).long() + (1 << (BITS - 1))
+        key = (place[:, 0] << (2 * BITS)) | (place[:, 1] << BITS) | place[:, 2]
+        stream = self.state.stream.index_select(0, grid.owner)
+        chosen = (x.index_select(0, rows) for x in (stream, key))
+        return law(self.state.seed, *chosen, 0, purpose, self.state.dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class _OfVoxels:
+    """A parameter of a distribution, a number or one per colony, as a distribution takes it."""
+
+    given: float | Tensor
+
+    def of_rows(self, voxels: _Voxels, rows: Tensor) -> Tensor:
+        """(M,) for the voxels `rows`."""
+        state = voxels.state
+        assert state.layout is not None
+        owner = state.layout.grid.owner.index_select(0, rows)
+        return _of_colonies(self.given, state).expand(state.colonies).index_select(0, owner)
+
+
+def _drawn(given: Distribution, name: str, what: str, state: State, corner: Corner) -> Tensor:
+    """One draw for each voxel, (nodes,), the same whatever the batch."""
+    assert state.layout is not None
+    rows = torch.arange(state.layout.grid.nodes, device=state.device)
+    values: Any = SimpleNamespace(**{n: _OfVoxels(getattr(given, n)) for n in given.parameters})
+    voxels: Any = _Voxels(state, corner)
+    return given.draw(voxels, rows, f"{what} of the signal {name}", values)
+
+
+def without_cells(signal: Signal, name: str, state: State, corner: Corner, time: float) -> Tensor:
+    """What a signal has become on every voxel at a time, h, (nodes,), where nothing moved it and no
+    cell was near: the solution of dc/dt = source − decay · c from its first values. signal: with
+    its schedule, if its source has one."""
+    value = on_grid(signal, name, "initial", state, corner)
+    rate = on_grid(signal, name, "decay", state, corner)
+    begin, source = 0.0, signal.source
+    for end in _until(source, time):
+        now = source.at(begin) if isinstance(source, Schedule) else source
+        made = on_grid(_Given(now), name, "source", state, corner)  # type: ignore[arg-type]
+        kept = torch.exp(-rate * (end - begin))
+        lasted = torch.where(rate > 0, -torch.expm1(-rate * (end - begin)) / rate, end - begin)
+        value, begin = value * kept + made * lasted, end
+    return value
+
+
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """The source of a signal while its schedule does not go on."""
+
+    source: OnGrid
+
+
+def _until(source: object, time: float) -> list[float]:
+    """When a source changes before a time, and the time."""
+    found = {time} if time > 0 else set()
+    if isinstance(source, Schedule):
+        again = int(time / source.period) + 1 if source.period else 1
+        for k in range(again):
+            found |= {t for x in source.times if 0 < (t := x + k * (source.period or 0.0)) < time}
+    return sorted(found)
