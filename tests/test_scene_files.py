@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -66,6 +67,7 @@ def test_a_design_of_a_file_is_its_function(folder):
             },
         ),
         {},
+        folder / "mine.py",
     )
     assert made.listing()[:2] == ["Growth(rate=0.7)", "Division(length=Uniform(low=3.0, high=3.5))"]
     assert (made.name, made.dt, made.settings) == (
@@ -109,16 +111,13 @@ def test_a_design_of_one_colony_starts_as_the_ready_scene_does(folder):
         ({"scene": 5, "parameters": {}}, "is no saved design"),
         ({**READY, "scene": "microcolonie"}, "scene = 'microcolonie'.*one of microcolony"),
         ({**READY, "scene": "none.py"}, "scene in .* = 'none.py'.*the name of a ready scene"),
-        ({**READY, "file": "/elsewhere/up.py"}, "'/elsewhere/up.py'.*below the current folder"),
-        ({**READY, "file": "../up.py"}, "'../up.py'.*below the current folder.*would be run"),
+        ({**READY, "file": "mine.py"}, "a function in 'mine.py'.*runs no code.*--code FILE.py"),
+        ({**READY, "file": "../up.py"}, "a function in '../up.py'.*runs no code.*--code FILE.py"),
+        ({**READY, "species": 5}, "species in .*best.json = 5.*a list of names"),
         ("[" * 100_000, "cannot be read as JSON"),
         (
             {**READY, "scene": "best.json"},
             "scene in .*best.json = 'best.json'.*the name of a ready scene",
-        ),
-        (
-            {**READY, "file": "other.json"},
-            "file in .*best.json = 'other.json'.*the path of a Python file",
         ),
         (
             {**READY, "parameters": {"rates": 1.0}},
@@ -127,6 +126,20 @@ def test_a_design_of_one_colony_starts_as_the_ready_scene_does(folder):
         ({**READY, "parameters": {"rate": "fast"}}, "rate = 'fast'.*a number"),
         ({**READY, "dt": 0}, "dt in .*best.json = 0.*above 0"),
         ({**READY, "dt": "0.1"}, "dt in .*best.json = '0.1'.*a number"),
+    ],
+)
+def test_a_bad_design_is_refused_in_words(folder, told, words):
+    path = saved(folder, told)
+    with pytest.raises(tf.InputError, match=words):
+        load_scene(path, {})
+
+
+OWN_DESIGN = {"scene": "lamp", "file": "mine.py", "function": "lamp", "parameters": {}}
+
+
+@pytest.mark.parametrize(
+    "told, words",
+    [
         (
             {"scene": "<lambda>", "file": "mine.py", "function": "<lambda>", "parameters": {}},
             "mine.py does not define `<lambda>`",
@@ -137,14 +150,40 @@ def test_a_design_of_one_colony_starts_as_the_ready_scene_does(folder):
         ),
         (
             {"scene": "number", "file": "mine.py", "function": "number", "parameters": {}},
-            "number in mine.py = 3.*a Scene, or a function",
+            "number in mine.py = 3.*a function that .*mine.py defines itself",
         ),
+        ({**OWN_DESIGN, "function": "rmtree"}, "rmtree in mine.py = <function.*defines itself"),
+        ({**OWN_DESIGN, "function": "Path"}, "Path in mine.py = <class.*defines itself"),
+        ({**OWN_DESIGN, "function": None}, "mine.py does not define `None`"),
     ],
 )
-def test_a_bad_design_is_refused_in_words(folder, told, words):
-    path = saved(folder, told)
+def test_a_bad_design_of_a_function_is_refused_in_words(folder, told, words):
+    """Also one that names what the user's file has imported: nothing of it is called."""
+    with open(folder / "mine.py", "a") as file:
+        file.write("\nfrom shutil import rmtree\nfrom pathlib import Path\n")
+    told = {**told, "parameters": {**told["parameters"]}}
+    if told["function"] == "rmtree":
+        (folder / "kept").mkdir()
+        told["parameters"] = {"path": "kept"}
     with pytest.raises(tf.InputError, match=words):
-        load_scene(path, {})
+        load_scene(saved(folder, told), {}, Path("mine.py"))
+    assert told["function"] != "rmtree" or (folder / "kept").is_dir()
+
+
+def test_code_is_asked_for_where_a_design_needs_it_alone(folder, command):
+    path = saved(folder, {**OWN_DESIGN, "cells": 2})
+    with pytest.raises(SystemExit, match=r"runs no code by itself.*--code FILE"):
+        command("info", path)
+    command("info", path, "--code", "mine.py")
+    command("run", path, "--code", "mine.py", "--out", "own.h5", "--no-picture")
+    command("resume", "own.h5", "--scene", path, "--code", "mine.py", "--cells", 3, "--no-picture")
+    for what, code, words in (
+        (OWN_DESIGN, "none.py", "--code = 'none.py'.*the path of a Python file"),
+        (READY, "mine.py", "left out: .*best.json is of a ready scene"),
+        ("microcolony", "mine.py", "it is for a saved design"),
+    ):
+        with pytest.raises(SystemExit, match=words):
+            command("info", what if isinstance(what, str) else saved(folder, what), "--code", code)
 
 
 @pytest.mark.parametrize(

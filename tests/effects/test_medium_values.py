@@ -125,7 +125,7 @@ def gives(u, s, p, cell):
 
 @pytest.mark.parametrize("exchange", ["together", "turns"])
 def test_voxels_beyond_what_cells_give_are_as_without_cells(exchange):
-    """Beside cells that give the signal: the corners of the box, far from all cells, decay alone."""
+    """Beside cells that give the signal, the corners of the box, far from all cells, decay."""
     scene = tf.Scene(
         *GROWING, tf.Circuit(gives, species="gfp"),
         tf.Medium(

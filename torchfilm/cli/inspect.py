@@ -32,13 +32,16 @@ class Info:
     """Scene name, Python file, model (.xml, .sbml, .ant), saved design, or results file."""
     set: list[str] = field(default_factory=list)
     """Parameters of the scene, as NAME=VALUE."""
+    code: Path | None = None
+    """The Python file of a saved design whose scene is a function of your own: a design itself runs
+    no code."""
 
     def __call__(self) -> None:
         path = Path(self.what)
         is_scene = path.suffix.lower() in (".py", ".json") or is_model(path)
         if path.suffix in (".h5", ".hdf5") or (path.is_file() and not is_scene):
             return self._of_results()
-        scene = load_scene(self.what, parse_settings(self.set))
+        scene = load_scene(self.what, parse_settings(self.set), self.code)
         # binding tries the rules and circuits, which shows what they read and write
         print(scene.bind(per_colony=True).describe())
 
@@ -80,6 +83,9 @@ class Explain:
     """Scene name, Python file, model (.xml, .sbml, .ant) or saved design."""
     set: list[str] = field(default_factory=list)
     """Parameters of the scene, as NAME=VALUE."""
+    code: Path | None = None
+    """The Python file of a saved design whose scene is a function of your own: a design itself runs
+    no code."""
     cells: int = 1000
     """Cells in each colony, for the estimate."""
     colonies: int | None = None
@@ -100,7 +106,7 @@ class Explain:
 
     def __call__(self) -> None:
         scene = accurate(
-            load_scene(self.scene, parse_settings(self.set)), self.preset, self.settings
+            load_scene(self.scene, parse_settings(self.set), self.code), self.preset, self.settings
         )
         use_threads(self.threads, max(scene.fixed_colonies, self.colonies or 1))
         print(
@@ -125,6 +131,9 @@ class Tune:
     """Greatest relative error of the observed quantities, such as 1% or 0.01."""
     set: list[str] = field(default_factory=list)
     """Parameters of the scene, as NAME=VALUE."""
+    code: Path | None = None
+    """The Python file of a saved design whose scene is a function of your own: a design itself runs
+    no code."""
     of: list[str] = field(default_factory=list)
     """The observed quantities: cells, volume, radius, overlap, species by name, "signal NAME"; by
     default all."""
@@ -152,7 +161,7 @@ class Tune:
             Settings.check_new(self.out)
         if self.plot is not None:
             check_new_picture("--plot", self.plot)
-        scene = load_scene(self.scene, parse_settings(self.set))
+        scene = load_scene(self.scene, parse_settings(self.set), self.code)
         use_threads(self.threads)  # tune itself chooses the number of colonies
         with _status_line() as watch:
             tuned = tune(

@@ -51,6 +51,9 @@ class Run:
     the end of the run."""
     set: list[str] = field(default_factory=list)
     """Parameters of the scene, as NAME=VALUE, such as --set dim=3 rate=0.8."""
+    code: Path | None = None
+    """The Python file of a saved design whose scene is a function of your own: a design itself runs
+    no code."""
     colonies: int | None = None
     """Independent colonies in the batch; by default as many as a parameter has values, or 1."""
     cells: int | None = None
@@ -91,7 +94,7 @@ class Run:
 
     def __call__(self) -> None:
         scene = accurate(
-            load_scene(self.scene, parse_settings(self.set)), self.preset, self.settings
+            load_scene(self.scene, parse_settings(self.set), self.code), self.preset, self.settings
         )
         plan = design(self.scene)
         cells, until = self.cells, self.until
@@ -169,6 +172,9 @@ class Resume:
     scene: Path | None = None
     """The Python file of the scene, or the saved design; not needed for a ready-made scene. (A
     results file contains data only, not the code of a scene.)"""
+    code: Path | None = None
+    """The Python file of a saved design whose scene is a function of your own: a design itself runs
+    no code."""
     cells: int | None = None
     """Stop once every colony has this many cells."""
     until: float | None = None
@@ -192,7 +198,8 @@ class Resume:
             raise InputError("resume needs an end: --cells or --until.")
         with Results(self.file) as results:
             if self.scene is not None:
-                scene = load_scene(str(self.scene), from_plain(results.settings))
+                settings = from_plain(results.settings)
+                scene = load_scene(str(self.scene), settings, self.code)
             elif results.recipe is not None:
                 scene = scenes.build(*results.recipe)
             else:

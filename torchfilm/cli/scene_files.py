@@ -32,14 +32,16 @@ OTHER_SUFFIX = (
 )
 
 
-def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -> Scene:
-    """A ready-made scene by name; or the `function` or Scene of that name in a Python file; or what
-    a CellModeller script asks for; or a colony with a model in SBML or Antimony; or the scene of a
-    saved design (.json). `parameters` replace those of the design. Raises InputError for anything
-    else."""
+def load_scene(what: str, parameters: dict[str, Any], code: Path | None = None) -> Scene:
+    """A ready-made scene by name; or the `scene` of a Python file, a Scene or a function; or what a
+    CellModeller script asks for; or a colony with a model in SBML or Antimony; or the scene of a
+    saved design (.json). `parameters` replace those of the design. code: the Python file of a
+    design whose scene is a function of the user's. Raises InputError for anything else."""
     path = Path(what)
     if path.suffix.lower() == ".json":
-        return _scene_of_design(what, parameters)
+        return _scene_of_design(what, parameters, code)
+    if code is not None:
+        raise checks.input_error("--code", str(code), "left out: it is for a saved design (.json)")
     if not path.suffix and path.name == what:
         return scenes.build(what, parameters)
     if path.is_file() and is_model(path):
@@ -55,27 +57,37 @@ def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -
     if is_script(path):
         made = _call(from_cellmodeller, f"CellModeller script {what}", {"path": path, **parameters})
         return made.replace(settings=to_plain(parameters))
-    names = _run_scene_file(path, what)
-    if function not in names:
+    return _scene_of_file(path, what, parameters)
+
+
+def _scene_of_file(
+    path: Path, what: str, parameters: dict[str, Any], function: str | None = None
+) -> Scene:
+    """The scene that the `scene` of a Python file is or returns; or a function of another name,
+    which the file must define itself: a design names it, which may come from elsewhere."""
+    names, name = _run_scene_file(path, what), function or "scene"
+    if name not in names:
         raise InputError(
-            f"{what} does not define `{function}`: write `{function} = torchfilm.Scene(…)`, or a"
-            f" function `{function}(…)` that returns one."
+            f"{what} does not define `{name}`: write `{name} = torchfilm.Scene(…)`, or a"
+            f" function `{name}(…)` that returns one."
         )
-    made = names[function]
+    made = names[name]
+    if function is not None:
+        _check_own(made, function, path, what)
     if callable(made) and not isinstance(made, Scene):
-        made = _call(made, f"{function}(…) in {what}", parameters)
+        made = _call(made, f"{name}(…) in {what}", parameters)
     elif parameters:
         raise checks.input_error(
             "--set",
             list(parameters),
-            f"left out: `{function}` in {what} is a Scene, not a function with parameters",
+            f"left out: `{name}` in {what} is a Scene, not a function with parameters",
         )
     if not isinstance(made, Scene):
         raise checks.input_error(
-            f"{function} in {what}", made, "a Scene, or a function that returns one"
+            f"{name} in {what}", made, "a Scene, or a function that returns one"
         )
-    name = path.stem if made.name == "scene" else made.name
-    return made.replace(name=name, settings=to_plain(parameters))
+    called = path.stem if made.name == "scene" else made.name
+    return made.replace(name=called, settings=to_plain(parameters))
 
 
 def _hint(path: Path) -> str:
@@ -88,35 +100,34 @@ def _hint(path: Path) -> str:
     return " ".join(hints)
 
 
-def _scene_of_design(what: str, parameters: dict[str, Any]) -> Scene:
+def _scene_of_design(what: str, parameters: dict[str, Any], code: Path | None) -> Scene:
     plan = design(what)
-    file, home = plan.get("file"), plan["scene"]
-    if file is not None:
-        home = _own_file(what, file)
+    given, home = {**plan["parameters"], **parameters}, plan["scene"]
+    if plan.get("file") is not None:
+        function = str(plan.get("function"))
+        made = _scene_of_file(_own_file(what, plan["file"], code), str(code), given, function)
+    elif code is not None:
+        raise checks.input_error("--code", str(code), f"left out: {what} is of a ready scene")
     elif not home.isidentifier():
         raise checks.input_error(f"scene in {what}", home, "the name of a ready scene")
-    made = load_scene(
-        home, {**plan["parameters"], **parameters}, str(plan.get("function") or "scene")
-    )
+    else:
+        made = load_scene(home, given)
     if not parameters:
         made.warn_if_not(what, plan)
     return made.replace(dt=checks.number(f"dt in {what}", plan.get("dt", made.dt), above=0.0))
 
 
-def _own_file(what: str, file: Any) -> str:
-    """The Python file that a saved design names. Raises InputError for one that is not below the
-    current folder: a design may come from elsewhere, and must not run any file of this machine."""
-    here = Path.cwd().resolve()
-    if not isinstance(file, str) or Path(file).suffix.lower() != ".py":
-        raise checks.input_error(f"file in {what}", file, "the path of a Python file")
-    if not Path(file).resolve().is_relative_to(here):
-        raise checks.input_error(
-            f"file in {what}",
-            file,
-            f"below the current folder, {here}",
-            "It would be run: if you trust it, change to its folder first.",
+def _own_file(what: str, file: Any, code: Path | None) -> Path:
+    """The Python file with the function of a saved design, as the user gives it. A design is data,
+    and may come from elsewhere: it does not choose what runs. Raises InputError without it."""
+    if code is None:
+        raise InputError(
+            f"{what} is a design of a function in {file!r}, and a design runs no code by itself."
+            " Give the Python file, if you trust it: --code FILE.py."
         )
-    return file
+    if not code.is_file() or code.suffix.lower() != ".py":
+        raise checks.input_error("--code", str(code), "the path of a Python file")
+    return code
 
 
 def _run_scene_file(path: Path, what: str) -> dict[str, Any]:
@@ -134,6 +145,14 @@ def _run_scene_file(path: Path, what: str) -> dict[str, Any]:
         if isinstance(error, InputError):
             raise InputError(f"{what}{at}: {error}") from error
         raise InputError(f"{what} cannot be run: {type(error).__name__}: {error}{at}") from error
+
+
+def _check_own(made: Any, function: str, path: Path, what: str) -> None:
+    """Raise InputError for what is no function of a file, or one that it has imported."""
+    code = getattr(inspect.unwrap(made) if callable(made) else made, "__code__", None)
+    if code is None or Path(code.co_filename) != path:
+        rule = f"a function that {what} defines itself, and that returns a Scene"
+        raise checks.input_error(f"{function} in {what}", made, rule)
 
 
 def _call(make: Callable[..., Any], name: str, parameters: dict[str, Any]) -> Any:
@@ -180,6 +199,9 @@ def design(what: str) -> dict[str, Any]:
             raise checks.input_error(
                 f"{name} in {what}", value, allowed, "Leave it out for the default."
             )
+    species = content.get("species", [])
+    if not isinstance(species, list) or not all(isinstance(n, str) for n in species):
+        raise checks.input_error(f"species in {what}", species, "a list of names")
     return content
 
 
