@@ -318,11 +318,14 @@ class Cells(metaclass=checks.KnownKeywords):
             reason = "no such file" if not Path(path).exists() else error
             raise checks.InputError(f"{path} cannot be read as HDF5 ({reason}).") from error
         with opened as file:
-            if group not in file:
+            checks.only_own_data(file)
+            if not isinstance(file.get(group), h5py.Group):
                 raise checks.input_error("group", group, f"a group of {path}")
-            columns = {
-                n: np.asarray(d) for n, d in file[group].items() if isinstance(d, h5py.Dataset)
-            }
+            parts = {n: d for n, d in file[group].items() if isinstance(d, h5py.Dataset)}
+            try:
+                columns = {n: np.asarray(d) for n, d in parts.items()}
+            except (OSError, MemoryError, ValueError) as error:
+                raise checks.InputError(f"{path} cannot be read as HDF5 ({error}).") from error
         from torchfilm.micrographs.cell_tables import Reading, table_cells
 
         reading = Reading(pixel_size, length_unit, angle_unit=angle_unit)

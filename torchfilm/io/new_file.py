@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -40,19 +41,38 @@ def check_new_file(
 
 
 @contextmanager
+def _telling(path: Path) -> Iterator[None]:
+    """Raise SimulationError where something cannot be written for `path`."""
+    try:
+        yield
+    except OSError as error:
+        why = why_not_written(error)
+        raise SimulationError(f"could not write {path}: {error}. {why}") from error
+
+
+@contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
     """Where to write a file, beside `path` and with its suffix, which it replaces at the end. An
     error or a kill before leaves what was at `path`. Raises SimulationError where the file cannot
     be written."""
-    beside = path.with_name(f".{path.stem}.new{path.suffix}")
-    try:
-        yield beside
-        os.replace(beside, path)
-    except OSError as error:
-        why = why_not_written(error)
-        raise SimulationError(f"could not write {path}: {error}. {why}") from error
-    finally:
-        beside.unlink(missing_ok=True)
+    with _telling(path):
+        # of a name at which nobody can have put a file, or a link to one
+        number, name = tempfile.mkstemp(f".new{path.suffix}", f".{path.stem}.", path.parent)
+        os.close(number)
+        beside = Path(name)
+        try:
+            yield beside
+            beside.chmod(path.stat().st_mode & 0o777 if path.exists() else 0o666 & ~_umask())
+            os.replace(beside, path)
+        finally:
+            beside.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    """What the process leaves out of the permissions of new files."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
 
 
 def check_new_folder(path: str | Path, parts: tuple[str, ...], files: str, overwrite: bool) -> Path:
@@ -90,23 +110,20 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
     """A new folder beside `path`, which it replaces at the end. An error or a kill before leaves
     what was at `path`. Raises SimulationError where something cannot be written."""
     target = path.resolve()
-    beside, old = (target.with_name(f".{target.name}.{word}") for word in ("new", "old"))
-    try:
-        for left in (beside, old):
-            shutil.rmtree(left, ignore_errors=True)
-        beside.mkdir()
-        yield beside
-        if target.exists():
-            os.replace(target, old)
-        os.replace(beside, target)
-    except OSError as error:
-        why = why_not_written(error)
-        raise SimulationError(f"could not write {path}: {error}. {why}") from error
-    finally:
-        if old.exists() and not target.exists():
-            os.replace(old, target)
-        for left in (beside, old):
-            shutil.rmtree(left, ignore_errors=True)
+    with _telling(path):
+        beside = Path(tempfile.mkdtemp(".new", f".{target.name}.", target.parent))
+        old = beside.with_suffix(".old")
+        try:
+            beside.chmod(0o777 & ~_umask())
+            yield beside
+            if target.exists():
+                os.replace(target, old)
+            os.replace(beside, target)
+        finally:
+            if old.exists() and not target.exists():
+                os.replace(old, target)
+            for left in (beside, old):
+                shutil.rmtree(left, ignore_errors=True)
 
 
 def check_frames(count: int, frames: object, path: Path) -> list[int]:

@@ -15,9 +15,14 @@ from typing import Any
 import h5py
 
 from torchfilm.io.layout import FORMAT, VERSION
+from torchfilm.io.schema import ROWS, check_attributes, check_datasets, damaged
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 
+# What HDF5 and h5py raise for a damaged file: a MemoryError where it says that it is huge.
+DAMAGE = (
+    OSError, KeyError, RuntimeError, ValueError, TypeError, IndexError, MemoryError, OverflowError,
+)  # fmt: skip
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
@@ -28,7 +33,7 @@ def blaming_file(file: h5py.File, name: str) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except (OSError, KeyError, RuntimeError, ValueError, TypeError, IndexError) as error:
+    except DAMAGE as error:
         raise InputError(
             f"{file.filename} is damaged: its {name!r} cannot be read ({error}). Use another copy"
             " of it, or other frames."
@@ -40,7 +45,10 @@ def read_dataset(file: h5py.File, name: str, at: int | slice | EllipsisType = ..
     if not file:
         raise InputError("the results file is closed: read inside `with tf.Results(…) as results:`")
     with blaming_file(file, name):
-        return file[name][at]
+        found = file[name][at]
+    if isinstance(at, slice) and at.stop is not None and len(found) < at.stop - (at.start or 0):
+        raise damaged(file, f"its {name!r} ends before row {at.stop}")
+    return found
 
 
 def read_attribute(file: h5py.File, name: str, missing: str | None = None) -> Any:
@@ -79,6 +87,18 @@ def committed(file: h5py.File) -> dict[str, int]:
     }
 
 
+def refresh(file: h5py.File) -> None:
+    """See what a run has written since, in a file that may grow."""
+    if not file.swmr_mode:
+        return
+    # first, because all that it counts was written before it
+    file["frames/step"].id.refresh()
+    for group in ROWS:
+        for name, dataset in file.get(group, {}).items():
+            if isinstance(dataset, h5py.Dataset) and f"{group}/{name}" != "frames/step":
+                dataset.id.refresh()
+
+
 def inode_of_open(file: h5py.File) -> int:
     """The inode of the open file, also after another file took its path."""
     return os.fstat(file.id.get_vfd_handle()).st_ino
@@ -98,6 +118,8 @@ def open_results(path: Path) -> h5py.File:
             )
         with blaming_file(file, "version"):
             version = int(file.attrs["version"])
+            if version != file.attrs["version"] or version < 1:
+                raise ValueError(f"it is {file.attrs['version']}")
         if version > VERSION:
             raise InputError(
                 f"{path} has format version {version}, newer than this torchfilm"
@@ -105,8 +127,12 @@ def open_results(path: Path) -> h5py.File:
             )
         with blaming_file(file, "/"):
             checks.only_own_data(file)
+            refresh(file)  # to look at a dataset is to know how long it was then
         if frame_count(file) == 0:
             raise InputError(f"{path} holds no finished frame.")
+        with blaming_file(file, "/"):
+            check_attributes(file)
+            check_datasets(file, committed(file))
     except InputError:
         file.close()
         raise

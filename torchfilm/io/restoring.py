@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchfilm.initial_cells import Cells
 from torchfilm.io.identity import check_fields, check_same_scene, declared_fields
+from torchfilm.io.schema import check_frame
 from torchfilm.model import bind
 from torchfilm.scene import Scene
 from torchfilm.signals.grid import Grid
@@ -51,6 +52,7 @@ def restore_state(
         return torch.from_numpy(np.ascontiguousarray(value)).to(device)
 
     recorded = results.frame(frame)
+    check_frame(results, frame, recorded)
     layout = template.layout
     if layout is not None:
         origin, shape, spacing = results.grid(frame)

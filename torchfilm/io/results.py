@@ -10,7 +10,6 @@ from pathlib import Path
 from types import EllipsisType
 from typing import Any
 
-import h5py
 import numpy as np
 import torch
 
@@ -27,6 +26,7 @@ from torchfilm.io.reading import (
     open_results,
     read_attribute,
     read_dataset,
+    refresh,
 )
 from torchfilm.io.restoring import cells_of, restore_state
 from torchfilm.io.table import Tables, data_frame
@@ -38,17 +38,6 @@ from torchfilm.tools.checks import InputError
 BY_NUMBER = {
     "time": "Frames go by number: int(abs(results.times - t).argmin()) is the one nearest to t h."
 }
-# Groups whose datasets grow with the run, beside frames/step.
-GROWING = (
-    "cells",
-    AT_CELLS,
-    "signals",
-    "lineage/births",
-    "lineage/ends",
-    "frames/colony",
-    "frames/grid",
-    "frames",
-)
 
 
 class Results(metaclass=checks.KnownKeywords):
@@ -171,14 +160,7 @@ class Results(metaclass=checks.KnownKeywords):
         if inode != inode_of_open(self.file):
             old, self.file = self.file, open_results(self.path)
             old.close()
-        if not self.file.swmr_mode:
-            return
-        # first, because all that it counts was written before it
-        self.file["frames/step"].id.refresh()
-        for group in GROWING:
-            for name, dataset in self.file.get(group, {}).items():
-                if isinstance(dataset, h5py.Dataset) and name != "step":
-                    dataset.id.refresh()
+        refresh(self.file)
 
     def _index(self, frame: int) -> int:
         try:

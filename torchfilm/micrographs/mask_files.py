@@ -174,6 +174,7 @@ def _delta_labels(path: Path, frame: int | None) -> np.ndarray:
     except OSError as error:
         raise checks.InputError(f"{path} cannot be read as netCDF ({error}).") from error
     with file:
+        checks.only_own_data(file)
         groups = [file[name] for name in sorted(file) if name.startswith("roi")]
         if not groups or any("label_stack" not in g or "frame" not in g for g in groups):
             raise checks.InputError(

@@ -1,0 +1,162 @@
+"""What a results file must hold for its parts to be read: its attributes, its datasets and their
+lengths; and what a frame must be for a run to go on from it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+
+from torchfilm.io.layout import AT_CELLS, LINEAGE
+from torchfilm.tools.checks import InputError
+
+if TYPE_CHECKING:
+    from torchfilm.io.results import Results
+
+WHOLE, NUMBER, ANY = "iu", "fiu", "fiub"  # kinds of NumPy's types
+WORDS = {WHOLE: "whole numbers", NUMBER: "numbers", ANY: "numbers"}
+# Of every file: what its entries are, and how many axes it has.
+DATASETS = {
+    "colony_id": (WHOLE, 1),
+    **{f"cells/{n}": (WHOLE, 1) for n in ("uid", "parent", "colony")},
+    **{f"cells/{n}": (NUMBER, 1) for n in ("length", "radius")},
+    **{f"cells/{n}": (NUMBER, 2) for n in ("position", "axis")},
+    **{f"frames/{n}": (WHOLE, 1) for n in ("first_row", "births", "ends", "step")},
+    **{f"frames/{n}": (WHOLE, 2) for n in ("counts", "next_uid")},
+    "frames/time": (NUMBER, 1),
+    **{f"lineage/{t}/{n}": (WHOLE, 1) for t in LINEAGE for n in LINEAGE[t] if n != "length"},
+}
+GRID = {"origin": (NUMBER, 3), "shape": (WHOLE, 3), "first_voxel": (WHOLE, 1)}
+# How many rows the groups of a file have that belong to its complete frames.
+ROWS = {
+    "cells": "rows",
+    AT_CELLS: "rows",
+    "signals": "voxels",
+    "lineage/births": "births",
+    "lineage/ends": "ends",
+    "frames": "frames",
+    "frames/colony": "frames",
+    "frames/grid": "frames",
+}
+
+
+def _is_recipe(found: Any) -> bool:
+    two = isinstance(found, list) and len(found) == 2
+    return found is None or (two and isinstance(found[0], str) and isinstance(found[1], dict))
+
+
+def _are_spans(found: Any) -> bool:
+    pair = lambda x: isinstance(x, list) and len(x) == 2 and all(map(_is_number, x))
+    return isinstance(found, dict) and all(map(pair, found.values()))
+
+
+def _is_number(found: Any) -> bool:
+    return isinstance(found, (int, float)) and not isinstance(found, bool)
+
+
+def _are_fields(found: Any) -> bool:
+    five = lambda x: (
+        isinstance(x, list)
+        and len(x) == 5
+        and isinstance(x[3], list)
+        and all(isinstance(x[k], str) for k in (0, 1, 2, 4))
+    )
+    return isinstance(found, dict) and all(map(five, found.values()))
+
+
+# What the attributes hold as JSON. Those that files of earlier versions lack may be missing.
+ATTRIBUTES: dict[str, Callable[[Any], bool]] = {
+    "declared": _are_fields,
+    "recipe": _is_recipe,
+    "settings": lambda x: isinstance(x, dict),
+    "accuracy": lambda x: isinstance(x, dict) and all(map(_is_number, x.values())),
+    "walls": lambda x: isinstance(x, list) and all(isinstance(w, dict) for w in x),
+    "periodic": _are_spans,
+    "internal": lambda x: isinstance(x, list) and all(isinstance(n, str) for n in x),
+    "effects": lambda x: x is None or (isinstance(x, list) and all(map(_is_text, x))),
+    "code": lambda x: x is None or isinstance(x, (list, dict, str)),
+}
+NEEDED = ("declared", "recipe", "settings")
+
+
+def _is_text(found: Any) -> bool:
+    return isinstance(found, str)
+
+
+def damaged(file: h5py.File, what: str) -> InputError:
+    """The error for a file that is not whole."""
+    return InputError(f"{file.filename} is damaged: {what}. Use another copy of it.")
+
+
+def check_attributes(file: h5py.File) -> None:
+    """Raise InputError for an attribute of the scene that is missing or of another kind."""
+    for name, fits in ATTRIBUTES.items():
+        if name not in file.attrs:
+            if name in NEEDED:
+                raise damaged(file, f"its {name!r} is missing")
+            continue
+        try:
+            sound = fits(json.loads(file.attrs[name]))
+        except (TypeError, ValueError, RecursionError):
+            sound = False
+        if not sound:
+            raise damaged(file, f"its {name!r} is not what torchfilm writes")
+    for name, least in (("dim", 2), ("seed", 0), ("every", 1), ("dt", 0)):
+        value = file.attrs.get(name)
+        if not isinstance(value, (int, float, np.number)) or not least <= value < np.inf:
+            raise damaged(file, f"its {name!r} is {value!r}")
+    if file.attrs.get("dtype") not in ("float32", "float64"):
+        raise damaged(file, f"its 'dtype' is {file.attrs.get('dtype')!r}")
+
+
+def check_datasets(file: h5py.File, sizes: Mapping[str, int]) -> None:
+    """Raise InputError for a dataset that is missing, of another kind, or too short. sizes: of the
+    complete part of the file, as `committed` tells them."""
+    wanted = dict(DATASETS)
+    if "frames/grid" in file:
+        wanted |= {f"frames/grid/{n}": about for n, about in GRID.items()}
+    for group in ROWS:
+        for name, part in file.get(group, {}).items():
+            if isinstance(part, h5py.Dataset):
+                wanted.setdefault(f"{group}/{name}", (ANY, 0))
+    for name, (kinds, axes) in wanted.items():
+        found = file.get(name)
+        if not isinstance(found, h5py.Dataset):
+            raise damaged(file, f"its {name!r} is missing")
+        if found.dtype.kind not in kinds or (axes and found.ndim != axes) or not found.ndim:
+            shape = "" if not axes else f" along {axes} axes"
+            raise damaged(file, f"its {name!r} does not hold {WORDS[kinds]}{shape}")
+        least = sizes[ROWS[name.rpartition("/")[0]]] if "/" in name else 1
+        if len(found) < least:
+            raise damaged(file, f"its {name!r} has {len(found)} rows, and should have {least}")
+    colonies, dim = len(file["colony_id"]), int(file.attrs["dim"])
+    for name in ("frames/counts", "frames/next_uid", "stream"):
+        if name in file and file[name].shape[-1] != colonies:
+            raise damaged(file, f"its {name!r} is not of {colonies} colonies")
+    for name in ("cells/position", "cells/axis"):
+        if file[name].shape[1] != dim:
+            raise damaged(file, f"its {name!r} is not of {dim} dimensions")
+
+
+def check_frame(results: Results, frame: int, cells: Mapping[str, np.ndarray]) -> None:
+    """Raise InputError for a frame from which no run can go on. cells: its columns."""
+    counts, uid, place = results.counts[frame], cells["uid"], cells["colony"]
+    owners = np.repeat(np.arange(len(counts)), counts)
+    wrong = ""
+    if not np.array_equal(owners, place):
+        wrong = "its cells are not those that its colonies count"
+    elif len(np.unique(np.stack([place, uid]), axis=1).T) < len(uid):
+        wrong = "two cells of a colony have one number"
+    elif len(uid) and (uid.min() < 0 or (uid >= results.next_uid(frame)[place]).any()):
+        wrong = "the numbers of new cells would be those of cells that there are"
+    elif not all(np.isfinite(cells[n]).all() for n in ("position", "axis", "length", "radius")):
+        wrong = "the place, axis, length or radius of a cell is not finite"
+    elif not ((cells["length"] >= 0).all() and (cells["radius"] > 0).all()):
+        wrong = "the length or radius of a cell is below 0"
+    elif not (np.isfinite(results.times[frame]) and results.steps[frame] >= 0):
+        wrong = "its time or step is none"
+    if wrong:
+        raise damaged(results.file, f"in frame {frame} {wrong}")
