@@ -17,16 +17,29 @@ import torchfilm as tf
 from design.parameters import Value
 from torchfilm import checks
 
+Stamp = tuple[int, int]  # of a file, by which it is known again
 SPARE_BYTES = 1 << 18  # of a file that grows by a generation
+
+
+def stamp(path: Path) -> Stamp | None:
+    """By what the file at a path is known to be the one that was read or written last; None where
+    there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns
 
 
 @contextmanager
 def replacing(
-    path: Path, form: str, version: int, about: Mapping[str, Any], kept: str
-) -> Iterator[h5py.File]:
+    path: Path, form: str, version: int, about: Mapping[str, Any], kept: str,
+    before: Stamp | None,
+) -> Iterator[h5py.File]:  # fmt: skip
     """A new file beside an older one, which it replaces at the end: a kill at any moment costs at
-    most what is being written. about: plain data; kept: what the older file holds, for the message.
-    Raises SimulationError where the file cannot be written."""
+    most what is being written. about: plain data; kept: what the older file holds, for the message;
+    before: the `stamp` of the file that it may replace. Raises SimulationError where the file
+    cannot be written, and where another process has put its own there."""
     beside = path.with_name(path.name + ".new")
     # a disk that fills while HDF5 writes may end the process
     needed = (path.stat().st_size if path.exists() else 0) + SPARE_BYTES
@@ -49,6 +62,12 @@ def replacing(
                 }
             )
             yield file
+        if stamp(path) not in (None, before):
+            beside.unlink(missing_ok=True)
+            raise tf.SimulationError(
+                f"{path} has been written by another process since this one read or wrote it."
+                " Nothing of it is replaced. Give each search a file of its own."
+            )
         os.replace(beside, path)
     except (BlockingIOError, FileExistsError) as error:
         raise tf.SimulationError(

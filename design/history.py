@@ -75,4 +75,4 @@ def write_csv(path: str | Path, columns: dict[str, list[Any]]) -> None:
     writer = csv.writer(text)
     writer.writerow(columns)
     writer.writerows(zip(*columns.values(), strict=True))
-    path.write_text(text.getvalue(), encoding="utf-8", newline="")
+    checks.write_text(path, text.getvalue())

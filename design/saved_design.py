@@ -80,7 +80,7 @@ def write_design(path: Path, design: FoundDesign, *, colonies: float) -> Path:
         },
     }
     saved |= _identity(task.family.function, json.dumps(saved["parameters"], default=_plain))
-    path.write_text(json.dumps(saved, indent=1, default=_plain) + "\n", encoding="utf-8")
+    checks.write_text(path, json.dumps(saved, indent=1, default=_plain) + "\n")
     return path
 
 

@@ -18,7 +18,7 @@ import torch
 
 import torchfilm as tf
 from design import colonies
-from design.data_file import reading, replacing, write_values
+from design.data_file import Stamp, reading, replacing, stamp, write_values
 from design.executors import check_executor
 from design.growing import FailedColony, grow
 from design.parameters import Value
@@ -107,6 +107,7 @@ def simulate_designs(
     if executor is not None:
         check_executor(executor)
     prior = prior or Prior(task.space)
+    before = None if path is None else stamp(path)
     known = _read(path, task, prior)
     seen(min(count, len(known)))
     draws = np.random.default_rng(task.seed)
@@ -116,7 +117,7 @@ def simulate_designs(
     run = partial(_simulate_part, task)
     for found in map(run, parts) if executor is None else executor.map(run, parts):
         known = known.followed_by(found)
-        _write(path, task, prior, known)
+        before = _write(path, task, prior, known, before)
         seen(len(known))
     return known.take(slice(0, count))
 
@@ -192,17 +193,21 @@ def shown_values(task: Task, points: np.ndarray) -> dict[str, list[Value]]:
     return {name: [values[name] for values in found] for name in task.space.names}
 
 
-def _write(path: Path | None, task: Task, prior: Prior, known: Simulations) -> None:
-    """In place of the older file, where there is one."""
+def _write(
+    path: Path | None, task: Task, prior: Prior, known: Simulations, before: Stamp | None
+) -> Stamp | None:
+    """In place of the older file, where there is one, whose `stamp` is `before`; the new one."""
     if path is None:
-        return
-    with replacing(path, FORMAT, VERSION, about(task, prior), "earlier simulations") as file:
+        return None
+    kept = "earlier simulations"
+    with replacing(path, FORMAT, VERSION, about(task, prior), kept, before) as file:
         file["points"], file["statistics"] = known.points, known.statistics
         names = list(observed_of(task).plan.names)
         file.create_dataset("names", data=names, dtype=h5py.string_dtype())
         for name, column in shown_values(task, known.points).items():
             write_values(file, name, column)
         file.attrs["reasons"] = json.dumps(known.reasons)
+    return stamp(path)
 
 
 def _read(path: Path | None, task: Task, prior: Prior) -> Simulations:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 import torchfilm as tf
+from design.data_file import Stamp, stamp
 from design.entries import Entry
 from design.history import history_of, write_csv
 from design.parameters import right_aligned, show_value
@@ -34,6 +35,7 @@ class Study:
     path: Path | None = None
     entries: list[Entry] = field(default_factory=list)
     finals: list[Entry] = field(default_factory=list)
+    _stamp: Stamp | None = None  # of its file, as it was read or written last
 
     @property
     def searched(self) -> float:
@@ -209,7 +211,8 @@ class Study:
 
     def _write(self) -> None:
         if self.path is not None:
-            write_study(self.path, StudyData(self.about, self.streams, self.entries, self.finals))
+            data = StudyData(self.about, self.streams, self.entries, self.finals)
+            self._stamp = write_study(self.path, data, self._stamp)
 
     @classmethod
     def open(
@@ -234,7 +237,8 @@ class Study:
     def read(cls, path: str | Path) -> Study:
         """The study in a file. Raises InputError where the file cannot be read."""
         path = checks.file_path("study", path)
+        before = stamp(path)
         data = read_study(path)
-        return cls(
-            data.about, tuple(data.about["names"]), data.streams, path, data.entries, data.finals
-        )
+        names = tuple(data.about["names"])
+        parts = data.streams, path, data.entries, data.finals
+        return cls(data.about, names, *parts, before)

@@ -26,7 +26,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from design.data_file import read_values, reading, replacing, write_values
+from design.data_file import Stamp, read_values, reading, replacing, stamp, write_values
 from design.entries import Entry
 from design.slopes import Slopes
 from torchfilm import checks
@@ -46,16 +46,18 @@ class StudyData:
     finals: list[Entry]
 
 
-def write_study(path: Path, data: StudyData) -> None:
-    """Write a study, in place of an older file. Raises SimulationError where that fails."""
+def write_study(path: Path, data: StudyData, before: Stamp | None) -> Stamp | None:
+    """Write a study, in place of the older file whose `stamp` is `before`, and return the new one.
+    Raises SimulationError where that fails."""
     kept = "earlier batches. Run the search again to resume it"
-    with replacing(path, FORMAT, VERSION, data.about, kept) as file:
+    with replacing(path, FORMAT, VERSION, data.about, kept, before) as file:
         file["streams"] = np.asarray(data.streams, np.int64)
         names = data.about["names"]
         _write_entries(file, data.entries, names, len(data.streams))
         if data.finals:
             most = max(e.replicates for e in data.finals)
             _write_entries(file.create_group("finals"), data.finals, names, most)
+    return stamp(path)
 
 
 def _write_entries(
@@ -150,8 +152,11 @@ def _read_entries(group: h5py.Group, streams: tuple[int, ...] | None = None) -> 
             )
         )
         at += rows
-    if at != len(designs["point"]):
-        raise ValueError(f"its batches have {at} designs, but it lists {len(designs['point'])}")
+    for name, column in {**designs, **columns}.items():
+        if len(column) != at:
+            raise ValueError(f"its batches have {at} designs, but {name} lists {len(column)}")
+    if not np.isfinite(designs["loss"]).all():
+        raise ValueError("a design has no loss")
     return out
 
 

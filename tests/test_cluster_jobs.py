@@ -17,6 +17,7 @@ from commands import shell
 import design
 import torchfilm as tf
 from torchfilm.io import layout, room
+from torchfilm.tools import whole_files
 
 Usage = namedtuple("Usage", "total used free")
 
@@ -89,7 +90,7 @@ def test_why_a_file_was_not_written():
         "disk full": [OSError(28, "No space left on device")],
     }
     for words, errors in said.items():
-        assert all(words in room.why_not_written(e) for e in errors)
+        assert all(words in whole_files.why_not_written(e) for e in errors)
 
 
 HOLD = """

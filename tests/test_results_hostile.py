@@ -4,6 +4,9 @@ that make no sense."""
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
+import time
 
 import h5py
 import numpy as np
@@ -11,6 +14,7 @@ import pytest
 
 import torchfilm as tf
 from design.data_file import reading
+from torchfilm.tools.whole_files import write_text
 
 
 @pytest.fixture(scope="module")
@@ -107,3 +111,187 @@ def test_a_name_that_no_file_can_have_is_refused(name):
         tf.simulate(scene, until=0.1, record=name)
     with pytest.raises(tf.InputError, match="is no path that a file can have"):
         tf.Results(name)
+
+
+def less(file, name, rows=1):
+    """The dataset without its last rows."""
+    values = file[name][:-rows]
+    del file[name]
+    file[name] = values
+
+
+@pytest.mark.parametrize(
+    "spoil, words",
+    [
+        (lambda f: f.__delitem__("cells/axis"), "its 'cells/axis' is missing"),
+        (lambda f: f.__delitem__("lineage/births/step"), "its 'lineage/births/step' is missing"),
+        (lambda f: less(f, "cells/axis", 600), r"its 'cells/axis' has \d+ rows, and should have"),
+        (lambda f: less(f, "lineage/births/step"), "its 'lineage/births/step' has"),
+        (lambda f: less(f, "frames/time"), "its 'frames/time' has"),
+        (lambda f: f.attrs.__setitem__("periodic", '{"x": 3}'), "its 'periodic' is not what"),
+        (lambda f: f.attrs.__setitem__("declared", '{"a": [1]}'), "its 'declared' is not what"),
+        (lambda f: f.attrs.__setitem__("effects", "7"), "its 'effects' is not what torchfilm wri"),
+        (lambda f: f.attrs.__setitem__("recipe", "[" * 5000), "its 'recipe' is not what"),
+        (lambda f: f.attrs.__setitem__("dtype", "load"), "its 'dtype' is 'load'"),
+        (lambda f: f.attrs.__setitem__("dt", np.nan), "its 'dt' is nan"),
+        (lambda f: f.attrs.__delitem__("declared"), "its 'declared' is missing"),
+        (lambda f: f.attrs.__setitem__("version", 0), "its 'version' cannot be read"),
+        (lambda f: f.attrs.__setitem__("version", 2.9), "its 'version' cannot be read"),
+    ],
+)
+def test_parts_that_are_missing_or_of_another_kind_are_reported(copy, spoil, words):
+    with h5py.File(copy, "a") as file:
+        spoil(file)
+    with pytest.raises(tf.InputError, match=f"copy.h5 is damaged: .*{words}"):
+        tf.Results(copy)
+
+
+@pytest.mark.parametrize("name", ["cells/length", "frames/counts", "lineage/ends/uid"])
+def test_parts_of_another_type_or_shape_are_reported(copy, name):
+    with h5py.File(copy, "a") as file:
+        count = len(file[name])
+        del file[name]
+        file[name] = np.full(count, b"text")
+    with pytest.raises(tf.InputError, match=f"its '{name}' does not hold"):
+        tf.Results(copy)
+
+
+def test_a_dataset_that_says_it_is_huge_is_reported(copy):
+    with h5py.File(copy, "a") as file:
+        del file["frames/step"]
+        file.create_dataset("frames/step", (2**40,), "i8", chunks=(1024,))
+    with pytest.raises(tf.InputError, match="damaged"):
+        tf.Results(copy)
+
+
+def last_rows(file):
+    first, count = (int(file[f"frames/{n}"][-1].sum()) for n in ("first_row", "counts"))
+    return slice(first, first + count)
+
+
+def change(name, value):
+    def spoil(file):
+        rows = last_rows(file) if name.startswith("cells/") else -1
+        column = file[name][...]
+        column[rows] = value
+        file[name][...] = column
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    "spoil, words",
+    [
+        (change("frames/next_uid", 0), "the numbers of new cells would be those of cells"),
+        (change("cells/uid", 3), "two cells of a colony have one number"),
+        (change("cells/colony", 1), "its cells are not those that its colonies count"),
+        (change("cells/position", np.inf), "is not finite"),
+        (change("cells/axis", np.nan), "is not finite"),
+        (change("cells/radius", 0.0), "is below 0"),
+        (change("frames/time", np.nan), "its time or step is none"),
+    ],
+)
+def test_no_run_goes_on_from_a_frame_that_makes_no_sense(copy, spoil, words):
+    """Nor does the file grow: a lineage would have had cells twice."""
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2))
+    with h5py.File(copy, "a") as file:
+        spoil(file)
+    with tf.Results(copy) as results, pytest.raises(tf.InputError, match=f"in frame .*{words}"):
+        results.state(scene)
+
+
+READER = """
+import sys, torchfilm as tf
+kept, seen = tf.Results(sys.argv[1]), 0
+while len(kept) < 20:
+    with tf.Results(sys.argv[1]) as fresh:
+        frame = fresh.frame(-1)
+        assert len({len(x) for x in frame.values()}) == 1
+        fresh.table(-1)
+        fresh.lineage()
+    kept.refresh()
+    table, lineage = kept.table(-1), kept.lineage()
+    seen += len(table["cell"]) > 0 and len(lineage) >= len(table["cell"])
+print("seen", seen)
+"""
+
+
+@pytest.mark.slow
+def test_another_process_reads_what_grows(tmp_path):
+    """Each frame is of one moment, with its lineage: HDF5 keeps the lengths that a process has
+    seen, so that the same process would not tell."""
+    path, reader = tmp_path / "grows.h5", None
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2))
+    record = tf.Recorder(path, scene, every=1)
+    for state in tf.simulate(scene, until=40.0, dt=0.1, cells=10**6, record=record):
+        if reader is None and path.exists():
+            command = [sys.executable, "-c", READER, str(path)]
+            reader = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        time.sleep(0.0 if state.step < 5 else 0.1 if state.step < 400 else 0.0)
+        if reader is not None and reader.poll() is not None:
+            break
+    assert reader is not None
+    said, _ = reader.communicate(timeout=60)
+    assert reader.returncode == 0 and int(said.split()[1]) > 0
+
+
+def test_cells_and_masks_in_other_places_are_not_read(tmp_path):
+    secret = elsewhere(tmp_path)
+    with h5py.File(tmp_path / "cells.h5", "w") as file:
+        for name in ("y_um", "angle_rad", "length_um"):
+            file[name] = np.array([3.0, 5.0])
+        file["x_um"] = h5py.ExternalLink(str(secret), "/s")
+    with pytest.raises(tf.InputError, match="'/x_um' lies in another place"):
+        tf.Cells.from_hdf5(tmp_path / "cells.h5")
+    with h5py.File(tmp_path / "delta.nc", "w") as file:
+        file["roi00"] = h5py.ExternalLink(str(secret), "/")
+    with pytest.raises(tf.InputError, match="'/roi00' lies in another place"):
+        tf.Cells.from_masks(tmp_path / "delta.nc", pixel_size=0.1)
+
+
+def test_exports_write_through_no_link_and_leave_the_files_of_others(whole, tmp_path, command):
+    """The name of the file that becomes the export cannot be known before."""
+    victim = tmp_path / "victim.txt"
+    victim.write_text("mine")
+    (tmp_path / ".cells.new.csv").symlink_to(victim)
+    (tmp_path / ".tree.new.nwk").write_text("mine, too")
+    for name in ("cells.csv", "tree.nwk"):
+        command("export", whole, tmp_path / name)
+        assert (tmp_path / name).is_file() and not (tmp_path / name).is_symlink()
+    assert victim.read_text() == "mine"
+    assert (tmp_path / ".tree.new.nwk").read_text() == "mine, too"
+    assert len(list(tmp_path.iterdir())) == 5
+
+
+def test_a_file_of_the_users_beside_the_results_stays(tmp_path):
+    scene, notes = tf.Scene(tf.Growth(rate=1.0), dim=2), tmp_path / "run.h5.new"
+    notes.write_text("my notes")
+    with pytest.raises(tf.InputError, match=r"run\.h5\.new is no results file: move"):
+        list(tf.simulate(scene, until=0.1, record=tmp_path / "run.h5"))
+    assert notes.read_text() == "my notes"
+    notes.unlink()
+    notes.symlink_to(tmp_path / "nowhere")
+    with pytest.raises(tf.InputError, match=r"Remove .*run\.h5\.new: it is a link"):
+        list(tf.simulate(scene, until=0.1, record=tmp_path / "run.h5"))
+
+
+def test_a_full_disk_leaves_the_older_file(tmp_path, monkeypatch):
+    """Texts and pictures are written beside the file that they replace."""
+    path = tmp_path / "kept.json"
+    write_text(path, "old")
+    path.chmod(0o640)
+
+    def full(*given, **named):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(path), "write_text", full)
+        with pytest.raises(
+            tf.SimulationError, match=r"kept\.json.*No space left.*Is the disk full"
+        ):
+            write_text(path, "new")
+    assert path.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
+    write_text(path, "new")
+    assert path.read_text() == "new" and path.stat().st_mode & 0o777 == 0o640
+    with pytest.raises(tf.SimulationError, match=r"Make the folder .*none first"):
+        write_text(tmp_path / "none" / "a.json", "new")

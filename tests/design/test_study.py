@@ -208,6 +208,22 @@ def test_colonies_of_a_study_count(tmp_path, monkeypatch):
     )
 
 
+def test_of_two_searches_at_one_path_one_goes_on(tmp_path):
+    """Both began where there was no file; the second to write is told, and the first study stays."""
+    path = tmp_path / "s.h5"
+    mine, other = search(seed=0), search(seed=1)
+    study = Study.open(path, {"names": ["make"]}, ("make",), (0,))
+    other.run(12, study=path, progress=False)
+    entry = Study.read(path).entries[0]
+    with pytest.raises(tf.SimulationError, match=r"s\.h5 has been written by another process"):
+        study.add(entry)
+    kept = Study.read(path)
+    assert kept.colonies == other.study.colonies and not path.with_name("s.h5.new").exists()
+    path.unlink()  # what is gone cannot be lost
+    mine.run(12, study=path, progress=False)
+    assert Study.read(path).colonies == mine.study.colonies
+
+
 def test_a_full_disk_is_reported_and_loses_nothing(tmp_path, monkeypatch):
     path, made = tmp_path / "s.h5", search()
     made.run(6, study=path, progress=False)
@@ -342,13 +358,23 @@ def spoiled(path, what):
             file["batches/rows"][0] = 40
         elif what == "reasons":
             file["designs/reasons"][0] = "nonsense"
+        elif what == "no loss":
+            file["designs/loss"][0] = np.nan
+        elif what == "short":
+            short = file["designs/loss"][:-1]
+            del file["designs/loss"]
+            file["designs/loss"] = short
         else:
             del file[what]
 
 
 @pytest.mark.parametrize(
-    "what", ["about", "about is a list", "rows", "reasons", "batches", "designs/loss", "streams"]
-)
+    "what",
+    [
+        "about", "about is a list", "rows", "reasons", "batches", "designs/loss", "streams",
+        "no loss", "short",
+    ],
+)  # fmt: skip
 def test_a_spoiled_file_is_refused(kept, tmp_path, what):
     shutil.copy(kept, tmp_path / "s.h5")
     spoiled(tmp_path / "s.h5", what)

@@ -10,11 +10,12 @@ from typing import Annotated, Any
 
 import tyro
 
-from torchfilm.io.new_file import check_frames, check_new_file, written_whole
+from torchfilm.io.new_file import check_frames, check_new_file
 from torchfilm.io.results import Results
 from torchfilm.io.table import Tables, data_frame, needed
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
+from torchfilm.tools.whole_files import write_text, written_whole
 
 TABLE, NEWICK, GRAPH, VTK = ".csv", ".nwk", ".graphml", ".vtkhdf"
 LIVES = ".lineage.csv"
@@ -169,8 +170,7 @@ class Export:
 
     def _newick(self, results: Results) -> list[Path]:
         path, text = self._new(results, NEWICK), results.lineage().to_newick(self._one())
-        with written_whole(path) as beside:
-            beside.write_text(text, encoding="utf-8")
+        write_text(path, text)
         return [path]
 
     def _graph(self, results: Results) -> list[Path]:

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchfilm.io.new_file import check_frames, check_new_file, written_whole
+from torchfilm.io.new_file import check_frames, check_new_file
 from torchfilm.io.raster import Raster, Rods, label_image, thickness_image
 from torchfilm.io.table import Tables, needed
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
+from torchfilm.tools.whole_files import written_whole
 
 if TYPE_CHECKING:
     from torchfilm.io.results import Results

@@ -11,9 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from torchfilm.io.room import why_not_written
 from torchfilm.tools import checks
-from torchfilm.tools.checks import SimulationError
+from torchfilm.tools.whole_files import telling, umask
 
 
 def check_new_file(
@@ -38,41 +37,6 @@ def check_new_file(
             hint = "Choose another, or replace it: overwrite=True, or --overwrite."
             raise checks.input_error("path", str(path), rule, hint)
     return found
-
-
-@contextmanager
-def _telling(path: Path) -> Iterator[None]:
-    """Raise SimulationError where something cannot be written for `path`."""
-    try:
-        yield
-    except OSError as error:
-        why = why_not_written(error)
-        raise SimulationError(f"could not write {path}: {error}. {why}") from error
-
-
-@contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
-    """Where to write a file, beside `path` and with its suffix, which it replaces at the end. An
-    error or a kill before leaves what was at `path`. Raises SimulationError where the file cannot
-    be written."""
-    with _telling(path):
-        # of a name at which nobody can have put a file, or a link to one
-        number, name = tempfile.mkstemp(f".new{path.suffix}", f".{path.stem}.", path.parent)
-        os.close(number)
-        beside = Path(name)
-        try:
-            yield beside
-            beside.chmod(path.stat().st_mode & 0o777 if path.exists() else 0o666 & ~_umask())
-            os.replace(beside, path)
-        finally:
-            beside.unlink(missing_ok=True)
-
-
-def _umask() -> int:
-    """What the process leaves out of the permissions of new files."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def check_new_folder(path: str | Path, parts: tuple[str, ...], files: str, overwrite: bool) -> Path:
@@ -110,11 +74,11 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
     """A new folder beside `path`, which it replaces at the end. An error or a kill before leaves
     what was at `path`. Raises SimulationError where something cannot be written."""
     target = path.resolve()
-    with _telling(path):
+    with telling(path):
         beside = Path(tempfile.mkdtemp(".new", f".{target.name}.", target.parent))
         old = beside.with_suffix(".old")
         try:
-            beside.chmod(0o777 & ~_umask())
+            beside.chmod(0o777 & ~umask())
             yield beside
             if target.exists():
                 os.replace(target, old)

@@ -15,7 +15,7 @@ from typing import Any
 import h5py
 
 from torchfilm.io.layout import FORMAT, VERSION
-from torchfilm.io.schema import ROWS, check_attributes, check_datasets, damaged
+from torchfilm.io.schema import ROWS, check_attributes, check_datasets, check_lengths, damaged
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 
@@ -128,11 +128,11 @@ def open_results(path: Path) -> h5py.File:
         with blaming_file(file, "/"):
             checks.only_own_data(file)
             refresh(file)  # to look at a dataset is to know how long it was then
-        if frame_count(file) == 0:
-            raise InputError(f"{path} holds no finished frame.")
-        with blaming_file(file, "/"):
             check_attributes(file)
-            check_datasets(file, committed(file))
+            check_datasets(file)
+            if frame_count(file) == 0:
+                raise InputError(f"{path} holds no finished frame.")
+            check_lengths(file, committed(file))
     except InputError:
         file.close()
         raise

@@ -36,12 +36,13 @@ from torchfilm.io.layout import (
 from torchfilm.io.parameters import write_parameters
 from torchfilm.io.reading import committed, inode_of_open
 from torchfilm.io.results import Results
-from torchfilm.io.room import SPARE_BYTES, check_room, free_bytes, why_not_written
+from torchfilm.io.room import SPARE_BYTES, check_room, free_bytes
 from torchfilm.model import Model
 from torchfilm.scene import Scene
 from torchfilm.state import FATES, State
 from torchfilm.tools import checks
 from torchfilm.tools.checks import SimulationError
+from torchfilm.tools.whole_files import why_not_written
 from torchfilm.version import __version__
 
 # Suffixes of formats that a run might be thought to write: such a name would mislead.

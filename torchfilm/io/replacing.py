@@ -14,7 +14,7 @@ from typing import Any
 import h5py
 
 from torchfilm.io.layout import AT_CELLS, CHUNK_ROWS, FORMAT, create_framed, create_table
-from torchfilm.io.reading import committed, inode_of_open, open_results
+from torchfilm.io.reading import SIGNATURE, committed, inode_of_open, open_results
 from torchfilm.tools import checks
 
 try:
@@ -82,7 +82,11 @@ def create_file(path: Path) -> h5py.File:
     """Create a new HDF5 file. A file that an earlier run left at this path is deleted first: its
     inode may still be open elsewhere, so it is not truncated. Raises InputError where another
     process is writing it."""
+    if path.is_symlink():
+        rule, hint = "a path beside which no link stands", f"Remove {path}: it is a link."
+        raise checks.input_error("record", str(path).removesuffix(".new"), rule, hint)
     if path.exists():
+        _check_ours(path)
         if time.time() - path.stat().st_mtime < JUST_MADE and not _is_held(path):
             time.sleep(JUST_MADE)  # from the creation of a file to its lock there are moments
         if _is_held(path):
@@ -101,6 +105,16 @@ def create_file(path: Path) -> h5py.File:
             "in a folder where HDF5 can create and lock files",
             f"{error}. On a file system without locks, set HDF5_USE_FILE_LOCKING=FALSE.",
         ) from error
+
+
+def _check_ours(path: Path) -> None:
+    """Raise InputError for a file beside the results that no run has left there."""
+    with path.open("rb") as file:
+        head = file.read(len(SIGNATURE))
+    if head != SIGNATURE[: len(head)]:
+        rule = f"a path beside which {path.name} is free"
+        hint = f"{path} is no results file: move it, or choose another path."
+        raise checks.input_error("record", str(path).removesuffix(".new"), rule, hint)
 
 
 def _written_by_another(path: Path) -> checks.InputError:

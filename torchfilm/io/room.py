@@ -3,7 +3,6 @@ file, and may end the process."""
 
 from __future__ import annotations
 
-import errno
 import os
 import shutil
 from pathlib import Path
@@ -18,7 +17,6 @@ except ImportError:  # not on Windows
     resource = None  # type: ignore[assignment]
 
 SPARE_BYTES = 65536  # that HDF5 may need in addition to the arrays of a frame
-LOCKED = (errno.EAGAIN, errno.EACCES)
 
 
 def free_bytes(folder: Path, written: int = 0) -> int:
@@ -55,12 +53,3 @@ class Room:
             self.pending, then = 0, "Free some space and try again."
             check_room(self.path, size, f"to write {self.path}", then, written())
         self.pending += size
-
-
-def why_not_written(error: BaseException) -> str:
-    """What may be wrong where HDF5 could not write, as a sentence."""
-    if (isinstance(error, OSError) and error.errno in LOCKED) or "unable to lock" in str(error):
-        return "Another process has the file open: give each process a file of its own."
-    if isinstance(error, MemoryError) or "memory" in str(error).lower():
-        return "The process is out of memory: grow fewer colonies at once, or smaller ones."
-    return "Is the disk full?"

@@ -107,31 +107,20 @@ def check_attributes(file: h5py.File) -> None:
     for name, least in (("dim", 2), ("seed", 0), ("every", 1), ("dt", 0)):
         value = file.attrs.get(name)
         if not isinstance(value, (int, float, np.number)) or not least <= value < np.inf:
-            raise damaged(file, f"its {name!r} is {value!r}")
+            raise damaged(file, f"its {name!r} is {value}")
     if file.attrs.get("dtype") not in ("float32", "float64"):
         raise damaged(file, f"its 'dtype' is {file.attrs.get('dtype')!r}")
 
 
-def check_datasets(file: h5py.File, sizes: Mapping[str, int]) -> None:
-    """Raise InputError for a dataset that is missing, of another kind, or too short. sizes: of the
-    complete part of the file, as `committed` tells them."""
-    wanted = dict(DATASETS)
-    if "frames/grid" in file:
-        wanted |= {f"frames/grid/{n}": about for n, about in GRID.items()}
-    for group in ROWS:
-        for name, part in file.get(group, {}).items():
-            if isinstance(part, h5py.Dataset):
-                wanted.setdefault(f"{group}/{name}", (ANY, 0))
-    for name, (kinds, axes) in wanted.items():
+def check_datasets(file: h5py.File) -> None:
+    """Raise InputError for a dataset that is missing or of another kind."""
+    for name, (kinds, axes) in _datasets(file).items():
         found = file.get(name)
         if not isinstance(found, h5py.Dataset):
             raise damaged(file, f"its {name!r} is missing")
         if found.dtype.kind not in kinds or (axes and found.ndim != axes) or not found.ndim:
             shape = "" if not axes else f" along {axes} axes"
             raise damaged(file, f"its {name!r} does not hold {WORDS[kinds]}{shape}")
-        least = sizes[ROWS[name.rpartition("/")[0]]] if "/" in name else 1
-        if len(found) < least:
-            raise damaged(file, f"its {name!r} has {len(found)} rows, and should have {least}")
     colonies, dim = len(file["colony_id"]), int(file.attrs["dim"])
     for name in ("frames/counts", "frames/next_uid", "stream"):
         if name in file and file[name].shape[-1] != colonies:
@@ -139,6 +128,28 @@ def check_datasets(file: h5py.File, sizes: Mapping[str, int]) -> None:
     for name in ("cells/position", "cells/axis"):
         if file[name].shape[1] != dim:
             raise damaged(file, f"its {name!r} is not of {dim} dimensions")
+
+
+def _datasets(file: h5py.File) -> dict[str, tuple[str, int]]:
+    """What the datasets hold that a file must have, and of those that it has besides."""
+    wanted = dict(DATASETS)
+    if "frames/grid" in file:
+        wanted |= {f"frames/grid/{n}": about for n, about in GRID.items()}
+    for group in ROWS:
+        for name, part in file.get(group, {}).items():
+            if isinstance(part, h5py.Dataset):
+                wanted.setdefault(f"{group}/{name}", (ANY, 0))
+    return wanted
+
+
+def check_lengths(file: h5py.File, sizes: Mapping[str, int]) -> None:
+    """Raise InputError for a dataset that is too short. sizes: of the complete part of the file, as
+    `committed` tells them."""
+    for name in _datasets(file):
+        group = name.rpartition("/")[0]
+        if group and len(file[name]) < (least := sizes[ROWS[group]]):
+            rows = f"{len(file[name])} rows, and should have {least}"
+            raise damaged(file, f"its {name!r} has {rows}")
 
 
 def check_frame(results: Results, frame: int, cells: Mapping[str, np.ndarray]) -> None:

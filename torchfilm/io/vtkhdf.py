@@ -24,11 +24,12 @@ import h5py
 import numpy as np
 
 from torchfilm.io.capsule_mesh import Mesh, capsule, centreline
-from torchfilm.io.new_file import check_frames, check_new_file, written_whole
+from torchfilm.io.new_file import check_frames, check_new_file
 from torchfilm.io.room import Room
 from torchfilm.io.side_by_side import SideBySide, chosen_colonies, side_by_side
 from torchfilm.io.table import Tables
 from torchfilm.tools import checks
+from torchfilm.tools.whole_files import written_whole
 
 if TYPE_CHECKING:
     from torchfilm.io.results import Results

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchfilm.io.new_file import written_whole
 from torchfilm.pictures.colours import CELLS, Limits, PlotStyle
 from torchfilm.pictures.figures import checked_ids, state_figure
 from torchfilm.pictures.page import check_picture_path, checked_dpi, figure_class, save
@@ -100,5 +99,4 @@ class LivePlot(metaclass=checks.KnownKeywords):
             words = f"LivePlot({self.last})"
             self.output.show({"image/png": png, "text/plain": words}, {"image/png": size})
         if self.out is not None:  # at once, so that a viewer never reads half a picture
-            with written_whole(self.out) as beside:
-                save(figure, beside)
+            save(figure, self.out)

@@ -34,6 +34,7 @@ from torchfilm.pictures.draw import (
 from torchfilm.pictures.frames import Frame
 from torchfilm.pictures.shapes import Window, along, box, span, span_of_faces, window, with_images
 from torchfilm.tools import checks
+from torchfilm.tools.whole_files import written_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -358,13 +359,11 @@ def save(figure: Figure, path: str | Path) -> Path:
     Raises InputError if the format or the folder is not valid.
     """
     path = check_picture_path(path)
-    try:
-        figure.savefig(path, dpi=figure.dpi)
-    except (OSError, ValueError) as error:  # no such folder; no such kind of picture
-        raise checks.InputError(
-            f"{path} cannot be written as a picture: {error}. Choose a folder that exists and a"
-            " name that ends in .png, .pdf or .svg."
-        ) from error
+    if not path.parent.is_dir():
+        hint = f"Make {path.parent} first."
+        raise checks.input_error("picture", str(path), "in a folder that exists", hint)
+    with written_whole(path) as beside:
+        figure.savefig(beside, dpi=figure.dpi)
     return path
 
 

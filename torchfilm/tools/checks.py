@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchfilm.tools.warn_once import SMALL_SPECIES as SMALL_SPECIES  # public, for searches
 from torchfilm.tools.warn_once import once as once
+from torchfilm.tools.whole_files import write_text as write_text
 
 Number = float | int
 F = TypeVar("F", bound=Callable[..., Any])
@@ -224,7 +225,10 @@ def number(
     """Returns one finite number within bounds, or raises InputError."""
     if isinstance(value, bool) or not isinstance(value, Real):
         raise input_error(name, value, "a number", hint)
-    found = float(value)
+    try:
+        found = float(value)
+    except OverflowError:  # a whole number of Python's, of any length
+        raise input_error(name, value, _rule(above, least, most), hint) from None
     if not (math.isfinite(found) and found > above and least <= found <= most):
         raise input_error(name, value, _rule(above, least, most), hint)
     return found

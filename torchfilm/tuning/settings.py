@@ -16,6 +16,7 @@ from typing import Any
 
 from torchfilm.scene import Scene
 from torchfilm.tools import checks
+from torchfilm.tools.whole_files import write_text
 
 FORMAT = "torchfilm settings"
 
@@ -78,14 +79,7 @@ class Settings(metaclass=checks.KnownKeywords):
         written."""
         path = Path(path)
         Settings.check_new(path)
-        try:
-            path.write_text(
-                json.dumps({"format": FORMAT, **self.given}, indent=1) + "\n", encoding="utf-8"
-            )
-        except OSError as error:
-            raise checks.input_error(
-                "path", str(path), "a file that can be written", f"{error.strerror}."
-            ) from error
+        write_text(path, json.dumps({"format": FORMAT, **self.given}, indent=1) + "\n")
         return path
 
     @staticmethod
@@ -109,7 +103,7 @@ class Settings(metaclass=checks.KnownKeywords):
                 f"{path} cannot be read: {error.strerror}. `torchfilm tune SCENE --out FILE` writes"
                 " settings."
             ) from error
-        except ValueError:
+        except (ValueError, RecursionError):
             found = None
         if not isinstance(found, dict) or found.pop("format", None) != FORMAT:
             raise checks.InputError(

@@ -262,7 +262,10 @@ def _rem(b: Builder, x: Term, y: Term) -> Term:
 def _factorial(b: Builder, x: Term) -> Term:
     if isinstance(x, Expression):
         raise InputError("the formula has the factorial of a variable: only a number has one here")
-    return math.gamma(float(x) + 1)
+    try:
+        return math.gamma(float(x) + 1)
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"the formula has the factorial of {x:g}, which is no number") from error
 
 
 @_rule("function_arcsin")
