@@ -209,10 +209,10 @@ def test_colonies_of_a_study_count(tmp_path, monkeypatch):
 
 
 def test_of_two_searches_at_one_path_one_goes_on(tmp_path):
-    """Both began where there was no file; the second to write is told, and the first study stays."""
+    """Both began where there was no file: the second to write is told, the first study stays."""
     path = tmp_path / "s.h5"
     mine, other = search(seed=0), search(seed=1)
-    study = Study.open(path, {"names": ["make"]}, ("make",), (0,))
+    study = Study.open(path, {"names": ["make"]}, ("make",), tuple(range(8)))
     other.run(12, study=path, progress=False)
     entry = Study.read(path).entries[0]
     with pytest.raises(tf.SimulationError, match=r"s\.h5 has been written by another process"):
@@ -418,7 +418,7 @@ def test_a_table_lists_the_best_designs_first():
     values = (f"{best.values[name]:.4g}" for name in ("make", "decay"))
     assert lines[1].split()[2:] == [f"{cells:.0f}", *values]
     assert len(study.table(most=1000).splitlines()) == len(losses) + 1
-    assert Study({}, ("make",), (0,)).table() == "loss  ±  cells  make"
+    assert Study({}, ("make",), tuple(range(8))).table() == "loss  ±  cells  make"
 
 
 def test_info_says_what_was_searched_and_found():
