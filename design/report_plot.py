@@ -13,7 +13,7 @@ import torchfilm as tf
 from design.growing import FinishedColonies
 from design.parameters import Parameter, show_value
 from design.report import SearchReport, best_trivial, trivial_answers
-from design.targets.base import Target
+from design.targets.base import OUTSIDE, Target
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,7 +31,8 @@ def draw(report: SearchReport) -> Figure:
     grown = [_one_by_one(d.colonies)[:SHOWN] for d in designs]
     columns = max(1, *(len(g) for g in grown))
     target = report.task.target
-    frames = [[tf.pictures.frame_of(d.state).colony(k) for d, k in g] for g in grown]
+    names = _shown(target, report.best.colonies)
+    frames = [[_cells(d.state, k, names) for d, k in g] for g in grown]
     every = [cells for row in frames for cells in row]
     size = tuple(np.max([_extent(cells) for cells in every], axis=0)) if every else (1.0, 1.0)
     height = 6.2 if size[1] > 0.6 * size[0] else 4.6  # wide colonies leave room above
@@ -42,7 +43,9 @@ def draw(report: SearchReport) -> Figure:
     grid = figure.add_gridspec(
         3, columns + 1, width_ratios=[1.0] * columns + [1.5], height_ratios=[1.0, 1.0, 0.05]
     )
-    limits = _limits(target, frames[1] or every)  # a bright first guess must not hide the winner
+    limits = _limits(
+        target, names, frames[1] or every
+    )  # a bright first guess must not hide the winner
     scales: list[Any] = []
     for row, one in enumerate(designs):
         axes = [figure.add_subplot(grid[row, k]) for k in range(columns)]
@@ -72,10 +75,11 @@ def draw_colonies(
     """Draw the first colony of each design on axes of its own, with the target over it, in one
     scale of colours."""
     grown = [_one_by_one(finished)[:1] for finished in designs]
-    frames = [[tf.pictures.frame_of(d.state).colony(k) for d, k in g] for g in grown]
+    names = _shown(target, [finished for each in designs for finished in each])
+    frames = [[_cells(d.state, k, names) for d, k in g] for g in grown]
     every = [cells for row in frames for cells in row]
     size = tuple(np.max([_extent(cells) for cells in every], axis=0)) if every else (1.0, 1.0)
-    limits = _limits(target, every)
+    limits = _limits(target, names, every)
     for ax, one, cells, title in zip(axes, grown, frames, titles, strict=True):
         _draw_row([ax], one, cells, target, size, limits, title)
 
@@ -111,10 +115,33 @@ def _colour(name: str, place: int) -> str:
     return known.get(name.lower(), ("yellow", "cyan", "magenta", "red", "lime", "white")[place % 6])
 
 
-def _limits(target: Target, frames: list[dict[str, np.ndarray]]) -> dict[str, tuple[float, float]]:
-    """The range of colours of each species that the target reads in cells: that of these frames,
-    and up to what the target calls lit. One for both designs, so that these can be compared."""
-    names = [n for n in target.names if not n.startswith("out.")]
+def _shown(target: Target, grown: list[FinishedColonies]) -> list[str]:
+    """What the colours of cells show: what the target reads, signals at the cells, too. Of one that
+    reads no species and tells no strains apart, the first species, if there is one."""
+    if target.names or target.strains or not grown:
+        return list(target.names)
+    state = grown[0].state
+    species = [n for n, f in state.declared.items() if f.unit == "conc" and f.scope == "cell"]
+    return species[:1]
+
+
+def _cells(state: tf.State, place: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """The cells of the colony at `place`, with those signals at them that are shown."""
+    cells = tf.pictures.frame_of(state).colony(place)
+    signals = [n for n in names if n.startswith(OUTSIDE)]
+    contact = state.contact() if signals else None
+    if contact is not None:
+        mine = state.colony == place
+        found = {n: contact.found[n.removeprefix(OUTSIDE)][mine] for n in signals}
+        cells |= {n: x.detach().cpu().numpy() for n, x in found.items()}
+    return cells
+
+
+def _limits(
+    target: Target, names: Sequence[str], frames: list[dict[str, np.ndarray]]
+) -> dict[str, tuple[float, float]]:
+    """The range of colours of what is shown: that of these frames, and up to what the target calls
+    lit. One for both designs, so that these can be compared."""
     high = {n: max((float(f[n].max()) for f in frames), default=1.0) for n in names}
     return {n: (0.0, max(high[n], target.lit_from.get(n, 0.0)) or 1.0) for n in names}
 

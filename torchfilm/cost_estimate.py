@@ -139,9 +139,9 @@ def crowd(founders: Cells) -> Cells:
 def probe(scene: Scene, colonies: int, device: str | torch.device, seconds: float) -> CostProbe:
     """Runs a scene's first steps for about `seconds`, after a warm-up: one colony, then several.
     `colonies` is the number of colonies to seed."""
-    laid = True
+    laid = scene.founders.count > 0
     try:
-        laid_out = crowd(scene.founders)
+        laid_out = crowd(scene.founders) if laid else scene.founders
         model = scene.bind(colonies, cells=laid_out, device=device, per_colony=True)
     except checks.InputError:  # no room for a crowd, between walls or in the medium's box
         laid, model = False, scene.bind(colonies, device=device, per_colony=True)

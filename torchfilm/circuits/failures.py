@@ -28,7 +28,8 @@ def words(
         slope = circuit.rates(start.index_select(0, one), one)[0]
         names = (*circuit.species, *(f"out.{n}" for n in circuit.exchanged))
         if not bool((slope[: len(names)] < 0).any()):
-            return rosenbrock.STATUS[code] + _runaway(circuit, concentrations, k, dt)
+            away = _runaway(circuit, concentrations, k, dt)
+            return f"a concentration grows without end{away}" if away else rosenbrock.STATUS[code]
         first = int(torch.where(slope < 0, start[k] / -slope, torch.inf)[: len(names)].argmin())
         hint = ". Take more steps, or method='rosenbrock'" if method != "rosenbrock" else ""
         return (

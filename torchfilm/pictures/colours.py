@@ -53,6 +53,11 @@ class PlotStyle:
     section: float | str = CELLS
     whole: bool = False
 
+    @property
+    def shows_box(self) -> bool:
+        """Whether the box of a medium is seen, also where there is no cell."""
+        return self.background is not None or self.whole
+
     def __post_init__(self) -> None:
         from matplotlib.colors import is_color_like
 

@@ -121,8 +121,7 @@ def _one_time(
     dpi: float,
 ) -> Figure:
     """Colonies at one time. heading: the words before the time, where there is no title."""
-    boxed = (style.background is not None or style.whole) and frame.origin is not None
-    # the box of a medium is seen also where all cells are gone
+    boxed = style.shows_box and frame.origin is not None
     present = np.ones_like(frame.counts, dtype=bool) if boxed else frame.counts > 0
     places, more = choose_colonies(present, frame.colony_id, colonies, most)
     if title is not None and not isinstance(title, str):
@@ -203,7 +202,9 @@ def strip(
     with opened(what) as results:
         check_not_results(results.path, out)
         recorded = RecordedFrames(results, choose_frames(results.times, times, frames), background)
-        places, more = choose_colonies(recorded.present, results.colony_id, colonies, 4)
+        places, more = choose_colonies(
+            recorded.shown(style.shows_box), results.colony_id, colonies, 4
+        )
         layout = plan_layout(recorded, places, style)
         one = (
             f", colony {results.colony_id[places[0]]}"

@@ -168,10 +168,11 @@ class RecordedFrames(Sequence[Frame]):
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
 
-    @property
-    def present(self) -> np.ndarray:
-        """(B,) whether a colony has a cell in any of the frames."""
-        return np.asarray(self.results.counts[self.places].sum(0) > 0)
+    def shown(self, box: bool) -> np.ndarray:
+        """(B,) which colonies have something to draw: a cell in any of the frames, or the box of a
+        medium, where it is seen."""
+        boxed = box and bool(self.results.signal_names)
+        return np.asarray(boxed | (self.results.counts[self.places].sum(0) > 0))
 
     @property
     def times(self) -> np.ndarray:

@@ -31,6 +31,7 @@ from torchfilm.pictures.page import (
     set_page_title,
 )
 from torchfilm.tools import checks
+from torchfilm.tools.whole_files import written_whole
 
 FASTEST_GIF = 50.0  # frames per second; viewers slow down faster films
 GREYS = 104  # of the 256 colours of a GIF
@@ -71,19 +72,12 @@ def movie(
         check_not_results(results.path, out)
         last = len(results) - 1
         frames = RecordedFrames(results, sorted({*range(0, last + 1, every), last}), background)
-        places, more = choose_colonies(frames.present, results.colony_id, colonies, 9)
+        places, more = choose_colonies(
+            frames.shown(style.shows_box), results.colony_id, colonies, 9
+        )
         layout = plan_layout(frames, places, style)
-        part = target.with_name(f".{target.stem}.part{target.suffix}")
-        try:
-            write(part, Film(frames, layout, f"{view_note(style)}{more}", dpi), fps)
-            part.replace(target)
-        except OSError as error:
-            raise checks.InputError(
-                f"{target} cannot be written as a film: {error}. Choose a folder that exists and"
-                " has room."
-            ) from error
-        finally:
-            part.unlink(missing_ok=True)
+        with written_whole(target) as beside:
+            write(beside, Film(frames, layout, f"{view_note(style)}{more}", dpi), fps)
     return target
 
 

@@ -143,8 +143,11 @@ def check_tensors(
         if value.shape != now.shape and tuple(value.shape) != (wanted := tuple(shape(name))):
             rule = f"{wanted}, one value for each cell, colony or voxel first"
             raise checks.input_error(f"shape of the field {name!r}", tuple(value.shape), rule)
-        if name.startswith("out.") and not value.is_floating_point():
-            raise checks.input_error(f"type of the field {name!r}", value.dtype, f"{now.dtype}")
+        if name.startswith("out.") and value.dtype != now.dtype:
+            hint = f"Convert it: value.to({now.dtype})."
+            raise checks.input_error(
+                f"type of the field {name!r}", value.dtype, f"{now.dtype}, as the signals are", hint
+            )
 
 
 def check_fields(
