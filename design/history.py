@@ -75,4 +75,4 @@ def write_csv(path: str | Path, columns: dict[str, list[Any]]) -> None:
     writer = csv.writer(text)
     writer.writerow(columns)
     writer.writerows(zip(*columns.values(), strict=True))
-    checks.write_text(path, text.getvalue())
+    checks.write_whole(path, text.getvalue())

@@ -167,7 +167,7 @@ class Robustness:
             "reached": self.reached,
         }
         path = checks.file_path("path", path, ".json")
-        checks.write_text(path, json.dumps(saved, indent=1) + "\n")
+        checks.write_whole(path, json.dumps(saved, indent=1) + "\n")
         return path
 
     def plot(self, out: str | Path | None = None) -> tf.pictures.Picture:

@@ -80,7 +80,7 @@ def write_design(path: Path, design: FoundDesign, *, colonies: float) -> Path:
         },
     }
     saved |= _identity(task.family.function, json.dumps(saved["parameters"], default=_plain))
-    checks.write_text(path, json.dumps(saved, indent=1, default=_plain) + "\n")
+    checks.write_whole(path, json.dumps(saved, indent=1, default=_plain) + "\n")
     return path
 
 

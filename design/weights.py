@@ -25,7 +25,7 @@ def save_weights(module: torch.nn.Module, path: str | Path) -> Path:
         flat = value.detach().cpu().double().flatten().tolist()
         kind = str(value.dtype).removeprefix("torch.")
         stored[name] = {"dtype": kind, "shape": list(value.shape), "values": flat}
-    checks.write_text(path, json.dumps({"format": FORMAT, "weights": stored}, indent=1) + "\n")
+    checks.write_whole(path, json.dumps({"format": FORMAT, "weights": stored}, indent=1) + "\n")
     return path
 
 

@@ -50,6 +50,7 @@ ROOMS = {
             "torchfilm.cell_types",
             "torchfilm.medium_exchange",
             "torchfilm.film_shape",
+            "torchfilm.spatial",
             "torchfilm.rule_values",
             "torchfilm.rule_draws",
             "torchfilm.rule_views",

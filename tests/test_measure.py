@@ -136,12 +136,14 @@ def test_neighbours_within_no_such_gap_are_refused(gap):
         "overlaps", "colony_centre", "colony_radius", "depth", "nematic_order", "tilt",
         "neighbours", "wall_forces", "growth_rates", "strains", "heterozygosity",
         "pressure", "clusters", "alike_neighbours", "film", "displacement",
+        "below_top", "profile", "correlation",
     ],
 )  # fmt: skip
 def test_a_measure_of_no_state_is_refused(name):
     measure = getattr(tf.measure, name)
     more = {
         "neighbours": {"gap": 1.0}, "clusters": {"gap": 1.0}, "alike_neighbours": {"gap": 1.0},
+        "profile": {"name": "y", "edges": [0, 1]}, "correlation": {"name": "y", "edges": [0, 1]},
         "wall_forces": {"walls": [], "dt": 1.0},
         "growth_rates": {"earlier": None}, "displacement": {"earlier": None},
         "pressure": {"scene": None},
@@ -380,7 +382,7 @@ def test_strains_and_heterozygosity():
     [
         ({"name": "label"}, "a field of one whole number for a cell"),
         ({"name": "fitness"}, r"heterozygosity\(name\) = 'fitness'.*a field of the cells"),
-        ({"edges": [3.0]}, "two radii or more"),
+        ({"edges": [3.0]}, "two or more, µm, ascending"),
         ({"edges": [3.0, 3.0]}, "ascending"),
     ],
 )

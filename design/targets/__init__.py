@@ -3,6 +3,7 @@
 from design.targets.base import Target
 from design.targets.composition import Composition
 from design.targets.goals import Burden, Constrained, Duration, Goals, Spread, Weighted
+from design.targets.gradient import Gradient
 from design.targets.image import Image
 from design.targets.lasting import Lasting
 from design.targets.measured import Measured
@@ -10,7 +11,7 @@ from design.targets.observed import Observed
 from design.targets.observed_course import ObservedCourse
 from design.targets.oscillation import Oscillation
 from design.targets.patterns import DomainSize, OnFraction
-from design.targets.profiles import Bands, Gradient, ProfileTarget, Ring
+from design.targets.profiles import Bands, ProfileTarget, Ring
 from design.targets.stripe import Stripe
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Targets that give a level for each cell: bands, a ring, a gradient. (`stripe` and `image` have
+"""Targets that give a level for each cell: bands, a ring. (`gradient`, `stripe` and `image` have
 files of their own.)"""
 
 from __future__ import annotations
@@ -343,78 +343,3 @@ class Ring(ProfileTarget):
 
     def describe(self) -> str:
         return f"{self.species} in a ring of radius {self.radius:g} µm, {self.width:g} µm wide"
-
-
-@dataclass(frozen=True)
-class Gradient(ProfileTarget):
-    """A gradient: the target level falls linearly from 1 at `low` to 0 at `high`, µm from `centre`
-    along one of the coordinates of `Bands`. It is constant beyond them.
-
-    With low > high it rises. centre, floor: as for `Bands`.
-    """
-
-    species: str
-    along: str
-    low: float
-    high: float
-    _: KW_ONLY
-    centre: Centre = (0.0, 0.0)
-    floor: float = 0.0
-
-    def __post_init__(self) -> None:
-        species_name("Gradient.species", self.species)
-        checks.choice("Gradient.along", self.along, ALONG)
-        least = 0.0 if self.along == "radius" else -math.inf
-        checks.number("Gradient.low", self.low, least=least)
-        checks.number("Gradient.high", self.high, least=least)
-        if self.low == self.high:
-            raise checks.input_error(
-                "Gradient.low, Gradient.high", (self.low, self.high), "two different places"
-            )
-        object.__setattr__(self, "centre", checked_centre("Gradient.centre", self.centre))
-        check_profile("Gradient", self.floor)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return (self.species,)
-
-    def check(self, state: tf.State) -> None:
-        super().check(state)
-        check_along("Gradient", self.along, self.centre, state)
-
-    def target_profile(self, state: tf.State) -> Tensor:
-        x = coordinate(state, self.along, self.centre)
-        return ((self.high - x) / (self.high - self.low)).clamp(0.0, 1.0).unsqueeze(1)
-
-    @torch.no_grad()
-    def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
-        """Those of every profile, and `correlation`, (B,), of level and target level, from −1 to
-        1."""
-        y, w = valid_levels(state, self.names)[0][:, 0], weights(state)
-        m = self.target_profile(state)[:, 0]
-        means = total(state, torch.stack([w, w * y, w * m], 1))
-        mean = (means[:, 1:] / means[:, :1]).index_select(0, state.colony)
-        dy, dm = y - mean[:, 0], m - mean[:, 1]
-        squares = total(state, torch.stack([w * dy * dm, w * dy * dy, w * dm * dm], 1))
-        return {
-            "correlation": ratio(squares[:, 0], (squares[:, 1] * squares[:, 2]).sqrt(), math.nan),
-            **super().measures(state),
-        }
-
-    def why_undefined(self, measure: str) -> str:
-        if measure == "correlation":
-            return (
-                f"all cells have one level, or all lie on one side of the gradient from"
-                f" {self.low:g} to {self.high:g} µm (grow larger colonies, or move the gradient)"
-            )
-        return super().why_undefined(measure)
-
-    def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        for edge, style in ((self.low, "-"), (self.high, ":")):
-            draw_edges(ax, state, place, self.along, self.centre, (edge,), COLOURS[0], style)
-
-    def describe(self) -> str:
-        return (
-            f"{self.species} in a gradient {in_words(self.along)} from 1 at {self.low:g} µm to 0 at"
-            f" {self.high:g} µm"
-        )

@@ -67,7 +67,7 @@ UNDEFINED = {
         Gradient("g", "x", 20.0, 30.0),
         lit,
         "correlation",
-        "one side of the gradient from 20 to 30 µm",
+        "gradient from 1 at 20 µm to 0 at 30 µm is flat",
     ),
     "contrast of a stripe": (Stripe("g", at=0.0, width=9.0), lit, "contrast", "farther than 18"),
     "peak of a stripe": (Stripe("g", at=0.0, width=9.0), alone, "peak", "fewer than three cells"),

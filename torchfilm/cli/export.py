@@ -15,7 +15,7 @@ from torchfilm.io.results import Results
 from torchfilm.io.table import Tables, data_frame, needed
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
-from torchfilm.tools.whole_files import write_text, written_whole
+from torchfilm.tools.whole_files import write_whole, written_whole
 
 TABLE, NEWICK, GRAPH, VTK = ".csv", ".nwk", ".graphml", ".vtkhdf"
 LIVES = ".lineage.csv"
@@ -170,7 +170,7 @@ class Export:
 
     def _newick(self, results: Results) -> list[Path]:
         path, text = self._new(results, NEWICK), results.lineage().to_newick(self._one())
-        write_text(path, text)
+        write_whole(path, text)
         return [path]
 
     def _graph(self, results: Results) -> list[Path]:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchfilm.tools.warn_once import SMALL_SPECIES as SMALL_SPECIES  # public, for searches
 from torchfilm.tools.warn_once import once as once
-from torchfilm.tools.whole_files import write_text as write_text
+from torchfilm.tools.whole_files import write_whole as write_whole
 
 Number = float | int
 F = TypeVar("F", bound=Callable[..., Any])

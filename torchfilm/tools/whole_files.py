@@ -24,7 +24,7 @@ def why_not_written(error: BaseException) -> str:
 @contextmanager
 def telling(path: Path) -> Iterator[None]:
     """Raise SimulationError where something cannot be written for `path`."""
-    from torchfilm.tools.checks import SimulationError  # it offers `write_text` itself
+    from torchfilm.tools.checks import SimulationError  # it offers `write_whole` itself
 
     try:
         yield
@@ -63,7 +63,7 @@ def written_whole(path: Path) -> Iterator[Path]:
             beside.unlink(missing_ok=True)
 
 
-def write_text(path: Path, text: str) -> None:
+def write_whole(path: Path, text: str) -> None:
     """Write a text file whole, in place of an older one. Raises SimulationError where it cannot be
     written."""
     with written_whole(path) as beside:

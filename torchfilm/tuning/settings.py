@@ -16,7 +16,7 @@ from typing import Any
 
 from torchfilm.scene import Scene
 from torchfilm.tools import checks
-from torchfilm.tools.whole_files import write_text
+from torchfilm.tools.whole_files import write_whole
 
 FORMAT = "torchfilm settings"
 
@@ -79,7 +79,7 @@ class Settings(metaclass=checks.KnownKeywords):
         written."""
         path = Path(path)
         Settings.check_new(path)
-        write_text(path, json.dumps({"format": FORMAT, **self.given}, indent=1) + "\n")
+        write_whole(path, json.dumps({"format": FORMAT, **self.given}, indent=1) + "\n")
         return path
 
     @staticmethod

@@ -17,7 +17,7 @@ from torchfilm.circuits.sbml.document import check_xml
 from torchfilm.circuits.sbml.own_marks import ARGUMENT, FUNCTIONS, NAMESPACE, PREFIX, definition
 from torchfilm.circuits.sbml.reading import OPTIONS, TIME
 from torchfilm.tools.checks import InputError
-from torchfilm.tools.whole_files import write_text
+from torchfilm.tools.whole_files import write_whole
 
 CORE = "http://www.sbml.org/sbml/level3/version2/core"
 MATHML = "http://www.w3.org/1998/Math/MathML"
@@ -125,7 +125,7 @@ def sbml_text(
 def write(path: str | Path, text: str) -> None:
     """Write a model that can be read again. Raises InputError where it cannot."""
     check_xml(text, str(path))
-    write_text(Path(path), text)
+    write_whole(Path(path), text)
 
 
 def _list(model: Element, what: str, each: Iterable[Mapping[str, str]]) -> Element:
