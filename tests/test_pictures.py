@@ -341,6 +341,24 @@ def test_the_box_is_drawn_also_where_all_cells_are_gone(style, tmp_path):
         tf.show(state, scene=scene)
 
 
+def test_runs_without_cells_are_explained_and_drawn(tmp_path):
+    """Reaction and diffusion alone: strips and films show the signal, as `show` does."""
+    medium = tf.Medium(
+        u=tf.Signal(1.0, initial=tf.Uniform(0.0, 1.0)), box=[[0, 0], [9, 9]], spacing=1.0
+    )
+    scene = tf.Scene(medium, dim=2, founders=tf.Cells(np.zeros((0, 2)), np.zeros((0, 2))))
+    assert "measured for" in str(tf.explain(scene, seconds=0.2))
+    path = tmp_path / "run.h5"
+    for _ in tf.simulate(scene, until=0.1, record=tf.Recorder(path, scene, every=2)):
+        pass
+    strip = tf.pictures.strip(path, background="u", frames=2)
+    assert [ax.get_title() for ax in strip.figure.axes[:2]] == ["t = 0 h", "t = 0.1 h"]
+    tf.pictures.movie(path, tmp_path / "run.gif", background="u")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.gif", "run.h5"]
+    with pytest.raises(tf.InputError, match="no cell to draw"):
+        tf.pictures.strip(path)
+
+
 def test_a_place_that_is_not_there_is_reported(recorded, tmp_path):
     with pytest.raises((tf.InputError, FileNotFoundError), match="nowhere"):
         tf.show(recorded, out=tmp_path / "nowhere" / "a.png")

@@ -20,6 +20,7 @@ from design import (
     Bands,
     Batch,
     Choice,
+    Measured,
     Objective,
     OnFraction,
     Parameter,
@@ -287,6 +288,32 @@ def test_colours_reach_what_the_target_calls_lit(target):
     figure = draw(searched(lit, LIT[:1], target)._report())
     bar = next(ax for ax in figure.axes if ax.get_title() == "gfp (conc)")
     assert [t.get_text() for t in bar.get_xticklabels()] == ["0", "500", "1000"]
+
+
+def sniffing(reach=1.0):
+    """Cells that find more of a signal at the left, whose production differs between designs."""
+    found = tf.Signal(0.0, source=lambda p: (p[:, 0] < 0).double())
+    circuit = tf.Circuit(lambda u, s, p, cell: {"gfp": p.reach * s.m}, species="gfp", reach=reach)
+    return tf.Scene(
+        circuit, tf.Medium(m=found, box=((-9, -9), (9, 9)), spacing=3.0), dim=2, dt=0.1,
+        founders=tf.inoculum(20, radius=8.0, seed=1),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("target", "title"),
+    [
+        (Bands(("out.m",), edges=(-9.0, 0.0)), "out.m (conc)"),
+        (Measured({"most": lambda s: s.groups.max(s.gfp)}, {"most": 0.1}, {"most": 1.0}), "gfp (con"),
+    ],
+)  # fmt: skip
+def test_what_a_target_reads_outside_of_cells_is_shown_and_else_a_species(target, title):
+    reach = [Parameter("reach", 0.1, 10.0, log=True)]
+    figure = draw(searched(sniffing, reach, target, cells=None, until=0.2)._report())
+    bar = next(ax for ax in figure.axes if ax.get_title().startswith(title))
+    shown = [ax for ax in figure.axes if ax.get_title().startswith(("first guess", "best"))]
+    colours = {tuple(c) for ax in shown for x in ax.collections for c in x.get_facecolors()}
+    assert bar.get_visible() and len(colours) > 1
 
 
 def test_trivial_answers_are_reduced_as_the_designs_are():

@@ -421,3 +421,30 @@ def test_the_soft_tail_of_an_edge_that_is_not_reached_is_no_pattern(target, plac
     wanted = target.target_profile(state)[:, 0]
     assert 0 < float(wanted.max()) < 0.25
     assert target.loss(state.with_fields(yfp=wanted)).tolist() == [1.0]
+
+
+def test_a_gradient_that_falls_as_an_exponential():
+    """What diffuses and decays is perfect; turned round, it falls the other way."""
+    x = np.linspace(-10.0, 60.0, 141)
+    wanted = np.exp(-np.maximum(x - 5.0, 0.0) / 20.0)
+    target = Gradient("yfp", "x", 5.0, decay_length=20.0)
+    assert float(target.loss(row(x, yfp=7 * wanted))) == pytest.approx(0.0, abs=1e-12)
+    turned = Gradient("yfp", "x", -5.0, decay_length=-20.0)
+    assert float(turned.loss(row(-x, yfp=wanted))) == pytest.approx(0.0, abs=1e-12)
+    even = float(target.loss(row(x, yfp=np.ones(141))))
+    assert even == pytest.approx(1 - wanted.sum() ** 2 / (141 * (wanted**2).sum()))
+    assert "from 1 at 5 µm by a factor of e in 20 µm" in target.describe()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({}, "Gradient.high, Gradient.decay_length = .*one of them"),
+        ({"high": 3.0, "decay_length": 2.0}, "Gradient.high, Gradient.decay_length = .*one of"),
+        ({"decay_length": 0.0}, "Gradient.decay_length = 0.0 .*other than 0"),
+        ({"decay_length": math.inf}, "Gradient.decay_length = inf"),
+    ],
+)
+def test_a_gradient_has_one_form(given, words):
+    with pytest.raises(tf.InputError, match=words):
+        Gradient("yfp", "x", 1.0, **given)
