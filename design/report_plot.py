@@ -13,7 +13,7 @@ import torchfilm as tf
 from design.growing import FinishedColonies
 from design.parameters import Parameter, show_value
 from design.report import SearchReport, best_trivial, trivial_answers
-from design.targets.base import OUTSIDE, Target
+from design.targets.base import OUTSIDE, Target, known
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -118,9 +118,12 @@ def _colour(name: str, place: int) -> str:
 def _shown(target: Target, grown: list[FinishedColonies]) -> list[str]:
     """What the colours of cells show: what the target reads, signals at the cells, too. Of one that
     reads no species and tells no strains apart, the first species, if there is one."""
-    if target.names or target.strains or not grown:
-        return list(target.names)
+    if not grown:
+        return []
     state = grown[0].state
+    if target.names or target.strains:
+        there = known(state)
+        return [n for n in target.names if n in there]
     species = [n for n, f in state.declared.items() if f.unit == "conc" and f.scope == "cell"]
     return species[:1]
 

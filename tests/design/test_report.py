@@ -304,7 +304,7 @@ def sniffing(reach=1.0):
     ("target", "title"),
     [
         (Bands(("out.m",), edges=(-9.0, 0.0)), "out.m (conc)"),
-        (Measured({"most": lambda s: s.groups.max(s.gfp)}, {"most": 0.1}, {"most": 1.0}), "gfp (con"),
+        (Measured({"most": lambda s: s.groups.max(s.gfp)}, {"most": 0.1}, {"most": 1.0}), "gfp ("),
     ],
 )  # fmt: skip
 def test_what_a_target_reads_outside_of_cells_is_shown_and_else_a_species(target, title):
