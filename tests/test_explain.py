@@ -392,3 +392,19 @@ def test_a_prompt_and_a_notebook_show_its_lines():
     told = tf.explain(tf.Scene(tf.Growth(rate=1.0), dim=2), seconds=0)
     assert repr(told) == str(told) and "\n" in repr(told)
     assert told._repr_html_().startswith("<pre") and told.splitlines()[0] in told._repr_html_()
+
+
+@pytest.mark.parametrize(
+    ("signal", "words"),
+    [
+        ({"diffusion": 100.0, "decay": 4.0}, "m reaches √(K/k) = 5 µm: 1.2 voxels, too few to"),
+        ({"diffusion": [400.0, 1600.0], "decay": 4.0}, "m reaches √(K/k) = 10 to 20 µm\n"),
+        ({"diffusion": 100.0}, None),
+        ({"diffusion": 100.0, "decay": lambda places: places[:, 0] * 0 + 1.0}, None),
+    ],
+)
+def test_how_far_a_signal_reaches_beside_the_voxels(signal, words):
+    box = tf.Medium(m=tf.Signal(initial=1.0, **signal), box=((0, 0), (16, 16)), spacing=4.0)
+    scene = tf.Scene(box, dim=2, founders=tf.Cells([[8.0, 8.0]], [[1.0, 0.0]]))
+    told = str(tf.explain(scene, seconds=0))
+    assert words in told if words else "reaches" not in told

@@ -7,8 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor
 
+from torchfilm.parameters import number_range
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.schedule import Schedule, checked_values
 from torchfilm.signals.space import checked_flow
@@ -20,6 +22,9 @@ OnGrid = float | Tensor | Callable[[Tensor], Tensor]
 # A velocity: two or three numbers (or one per colony each), or a function from positions (M, 3) µm
 # to velocities (M, 3).
 Flow = Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
+
+
+RESOLVED = 2.0  # voxels in the reach of a signal, below which its profile is coarse
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +66,20 @@ class Signal(metaclass=checks.KnownKeywords):
         }
         for name, value in given.items():
             object.__setattr__(self, name, value)
+
+
+def reach_of(name: str, signal: Signal, spacing: float) -> list[str]:
+    """How far a signal that decays reaches, √(K/k), beside the finest spacing, µm, as a line; none
+    where its decay is not one number, or 0."""
+    if callable(signal.decay):
+        return []
+    diffusion, decay = (torch.as_tensor(x).double() for x in (signal.diffusion, signal.decay))
+    if bool((decay <= 0).any() | (diffusion <= 0).any()):
+        return []
+    reach = (diffusion / decay).sqrt()
+    voxels = float(reach.min()) / spacing
+    few = "" if voxels >= RESOLVED else f": {voxels:.2g} voxels, too few to resolve it"
+    return [f"{name} reaches √(K/k) = {number_range(reach)} µm{few}"]
 
 
 def _number(name: str, given: Any) -> Any:
