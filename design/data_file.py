@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,18 +18,21 @@ import torchfilm as tf
 from design.parameters import Value
 from torchfilm import checks
 
-Stamp = tuple[int, int]  # of a file, by which it is known again
+Stamp = str  # of a file, by which it is known again
+UNREADABLE = "unreadable"
 SPARE_BYTES = 1 << 18  # of a file that grows by a generation
 
 
 def stamp(path: Path) -> Stamp | None:
-    """By what the file at a path is known to be the one that was read or written last; None where
-    there is none."""
-    try:
-        found = path.stat()
-    except OSError:
+    """The mark that a file at a path got as it was written, by which it is known again; None where
+    there is no file, and of one of an earlier version."""
+    if not path.is_file():
         return None
-    return found.st_ino, found.st_mtime_ns
+    try:
+        with h5py.File(path, "r") as file:
+            return str(file.attrs.get("written", "")) or None
+    except OSError:
+        return UNREADABLE
 
 
 @contextmanager
@@ -59,6 +63,7 @@ def replacing(
                     "about": json.dumps(about),
                     "torchfilm": tf.__version__,
                     "torch": str(torch.__version__),
+                    "written": secrets.token_hex(16),
                 }
             )
             yield file

@@ -207,7 +207,8 @@ def _write(
         for name, column in shown_values(task, known.points).items():
             write_values(file, name, column)
         file.attrs["reasons"] = json.dumps(known.reasons)
-    return stamp(path)
+        mark = str(file.attrs["written"])
+    return mark
 
 
 def _read(path: Path | None, task: Task, prior: Prior) -> Simulations:

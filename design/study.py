@@ -35,7 +35,8 @@ class Study:
     path: Path | None = None
     entries: list[Entry] = field(default_factory=list)
     finals: list[Entry] = field(default_factory=list)
-    _stamp: Stamp | None = None  # of its file, as it was read or written last
+    # of its file, as it was read or written last
+    _stamp: Stamp | None = field(default=None, compare=False, repr=False)
 
     @property
     def searched(self) -> float:

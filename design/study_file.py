@@ -26,7 +26,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from design.data_file import Stamp, read_values, reading, replacing, stamp, write_values
+from design.data_file import Stamp, read_values, reading, replacing, write_values
 from design.entries import Entry
 from design.slopes import Slopes
 from torchfilm import checks
@@ -57,7 +57,8 @@ def write_study(path: Path, data: StudyData, before: Stamp | None) -> Stamp | No
         if data.finals:
             most = max(e.replicates for e in data.finals)
             _write_entries(file.create_group("finals"), data.finals, names, most)
-    return stamp(path)
+        mark = str(file.attrs["written"])
+    return mark
 
 
 def _write_entries(

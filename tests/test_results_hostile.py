@@ -3,10 +3,12 @@ that make no sense."""
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -66,6 +68,7 @@ def test_what_others_have_added_does_no_harm(copy):
         for k in range(1200):
             file.create_group(f"notes/{k}")
         file["notes/again"] = file["notes"]  # a circle
+        file["frames/note"] = ["a", "b"]
     with tf.Results(copy) as results:
         assert len(results.frame(-1)["uid"]) > 1
 
@@ -135,6 +138,7 @@ def less(file, name, rows=1):
         (lambda f: f.attrs.__setitem__("dtype", "load"), "its 'dtype' is 'load'"),
         (lambda f: f.attrs.__setitem__("dt", np.nan), "its 'dt' is nan"),
         (lambda f: f.attrs.__delitem__("declared"), "its 'declared' is missing"),
+        (lambda f: (f.__delitem__("lineage/ends"), f.__setitem__("lineage/ends", 3)), "no group"),
         (lambda f: f.attrs.__setitem__("version", 0), "its 'version' cannot be read"),
         (lambda f: f.attrs.__setitem__("version", 2.9), "its 'version' cannot be read"),
     ],
@@ -296,3 +300,36 @@ def test_a_full_disk_leaves_the_older_file(tmp_path, monkeypatch):
     assert path.read_text() == "new" and path.stat().st_mode & 0o777 == 0o640
     with pytest.raises(tf.SimulationError, match=r"Make the folder .*none first"):
         write_whole(tmp_path / "none" / "a.json", "new")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(tf.SimulationError, match=r"There is a folder of this name\.$"):
+        write_whole(tmp_path / "folder", "new")
+
+
+def test_links_stay_and_lead_to_what_is_written(tmp_path):
+    (tmp_path / "store").mkdir()
+    kept, link = tmp_path / "store" / "kept.json", tmp_path / "link.json"
+    kept.write_text("old")
+    link.symlink_to(kept)
+    write_whole(link, "new")
+    assert link.is_symlink() and kept.read_text() == "new"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link.json", "store"]
+    write_whole(Path("/dev/null"), "gone")
+    assert Path("/dev/null").is_char_device()
+
+
+def test_permissions_are_those_of_new_files(tmp_path):
+    """As for any file that the process makes; nothing of the process is changed for that."""
+    before = os.umask(0o027)
+    try:
+        write_whole(tmp_path / "a.txt", "new")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o640
+
+
+def test_a_file_of_the_first_version_has_no_settings(copy):
+    with h5py.File(copy, "a") as file:
+        file.attrs["version"] = 1
+        del file.attrs["settings"]
+    with tf.Results(copy) as results:
+        assert results.settings == {} and len(results.table(-1)["cell"])

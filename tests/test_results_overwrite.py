@@ -172,7 +172,7 @@ def test_a_run_killed_before_its_first_frame_leaves_the_old_file_and_blocks_no_o
     only(old)
 
 
-@pytest.mark.parametrize("left", [b"", b"\x89HDF\r\n\x1a\n", b"half a file"])
+@pytest.mark.parametrize("left", [b"", b"\x89HDF\r\n\x1a\n", b"\x89HDF\r\n\x1a\nhalf a file"])
 def test_a_broken_file_of_an_earlier_run_is_no_hindrance(tmp_path, left):
     path, scene = tmp_path / "run.h5", make_scene()
     replacing.beside(path).write_bytes(left)

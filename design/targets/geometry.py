@@ -61,7 +61,13 @@ def check_along(target: str, along: str, centre: Centre, state: tf.State) -> Non
         hint = 'A film in the plane grows along "y".'
         raise checks.input_error(f"{target}.along", along, "one that the plane has", hint)
     if along == "top":
-        tf.measure.below_top(state)  # says what a state lacks whose film has no floor
+        ground = "xyz"[: state.dim - 1]
+        if state.space is None or any(a not in state.space.faces for a in ground):
+            faces = ", ".join(f"{a!r}: (0, 40)" for a in ground)
+            hint = f"Write tf.Mechanics(periodic={{{faces}}}), as the scene biofilm does."
+            rule = f"another one, as space is not periodic along {' and '.join(ground)}"
+            raise checks.input_error(f"{target}.along", along, rule, hint)
+        tf.measure.below_top(state)  # says where there is no floor
     axes = {"x": "x", "y": "y", "radius": "xy", "edge": "xy"}.get(along, "")
     around = periodic_along(state, axes)
     if around and along == "edge":

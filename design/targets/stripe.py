@@ -13,7 +13,7 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import contrast, ratio, species_name, total, valid_levels, weights
-from design.targets.border import border, from_border, on_axis
+from design.targets.borders import border, from_border, on_axis
 from design.targets.geometry import (
     COLOURS,
     between,
@@ -199,14 +199,10 @@ class Stripe(ProfileTarget):
         light = w * (y - torch.nan_to_num(dark).index_select(0, state.colony)).clamp(min=0.0)
         found = {"place_um": ratio(total(state, light * x), total(state, light), math.nan)}
         kept = (w > 0).cpu().numpy()
-        columns = (
-            state.colony,
-            x,
-            on_axis(state, self.along),
-            on_axis(state, "y" if self.along == "x" else "x"),
-            y,
-            w,
-        )
+        place = on_axis(state, self.along)
+        if not isinstance(self.at, str):  # of the nearest image
+            place = self.at + x
+        columns = (state.colony, x, place, on_axis(state, "y" if self.along == "x" else "x"), y, w)
         owner, away_from, along, across, level, weight = (v.cpu().numpy()[kept] for v in columns)
         peak, width = profile(owner, away_from, level, weight, state.colonies)
         straight = straightness(owner, along, across, level, weight, peak)

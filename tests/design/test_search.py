@@ -322,8 +322,9 @@ def test_a_saved_design_runs_as_it_was_scored(command, tmp_path, kind):
     made = search(Sobol(batch=2), **SAVED[kind](tmp_path))
     best = made.run(4, progress=False)
     best.save("best.json")
+    code = ["--code", tmp_path / "mine.py"] if kind.startswith("file") else []
     target, cells = made.objective.task.target, made.objective.task.cells
-    command("run", "best.json", "--out", "one.h5", "--no-picture")
+    command("run", "best.json", *code, "--out", "one.h5", "--no-picture")
     with tf.Results("one.h5") as results:
         state = results.state(best.scene())
         assert (
@@ -332,7 +333,8 @@ def test_a_saved_design_runs_as_it_was_scored(command, tmp_path, kind):
         )
         assert state.cells >= cells if cells else state.time == pytest.approx(1.1)
     assert float(target.loss(state)[0]) == best.losses[0]
-    command("run", "best.json", "--colonies", 2, "--out", "two.h5", "--every", 1, "--no-picture")
+    some = "--colonies", 2, "--every", 1
+    command("run", "best.json", *code, *some, "--out", "two.h5", "--no-picture")
     with tf.Results("two.h5") as results:
         counts = results.counts[:]
         for k in range(2):
@@ -377,21 +379,9 @@ def test_a_saved_design_is_complete(tmp_path):
 def test_given_settings_override_the_saved(command, tmp_path):
     best = search(**SAVED["file"](tmp_path)).run(6, progress=False)
     best.save("best.json")
-    command(
-        "run",
-        "best.json",
-        "--set",
-        "make=3.0",
-        "--until",
-        0.2,
-        "--seed",
-        1,
-        "--dt",
-        0.05,
-        "--out",
-        "a.h5",
-        "--no-picture",
-    )
+    given = "--set", "make=3.0", "--until", 0.2, "--seed", 1, "--dt", 0.05
+    code = "--code", tmp_path / "mine.py"
+    command("run", "best.json", *given, *code, "--out", "a.h5", "--no-picture")
     with tf.Results("a.h5") as results:
         assert (
             results.attributes["seed"] == 1

@@ -145,10 +145,28 @@ def test_what_a_periodic_space_does_not_have(target, words):
         target.check(state)
 
 
-def test_a_film_needs_a_floor_that_ends():
-    state = film([[1.0, 1.0]], periodic=())
-    with pytest.raises(tf.InputError, match="how far the floor reaches along x"):
+@pytest.mark.parametrize("box", [False, True])
+def test_the_top_is_that_of_a_periodic_film(box):
+    """The floor of a box may grow, or end below cells: colonies would differ in it."""
+    medium = tf.Medium(m=tf.Signal(1.0, source=1.0), box=((0, 0), (20, 20)), spacing=1.0)
+    cells = tf.Cells([[1.0, 1.0]], [[1.0, 0.0]], extra={"gfp": [1.0]})
+    state = tf.Scene(tf.Growth(rate=1.0), *[medium] * box, founders=cells, dim=2).bind().start()
+    with pytest.raises(tf.InputError, match=r"Bands.along = 'top'.*periodic along x. Write tf.Mec"):
         Bands(("gfp",), (0, 3), along="top").check(state)
+
+
+def test_a_stripe_at_a_face_is_as_straight_as_elsewhere():
+    """A wavy stripe, moved around the faces: all measures are those of the same stripe."""
+    place = np.stack([v.ravel() + 0.5 for v in np.meshgrid(*[np.arange(20.0)] * 2)], 1)
+    lit = np.abs(place[:, 0] - 10 - 2 * np.sin(2 * np.pi * place[:, 1] / 20)) < 2
+    here = Stripe("gfp", at=10.0, width=4.0).measures(film(place, lit, periodic=("x", "y")))
+    there = place * 1.0
+    there[:, 0] = (there[:, 0] - 10.0) % PERIOD
+    moved = film(there, lit, periodic=("x", "y"))
+    at_face = Stripe("gfp", at=0.0, width=4.0).measures(moved)
+    assert float(here["straightness_um"]) > 0.5
+    for name, value in here.items():
+        assert float(at_face[name]) == pytest.approx(float(value), abs=1e-9), name
 
 
 def test_observed_places_in_a_periodic_space():

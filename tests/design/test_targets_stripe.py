@@ -12,7 +12,7 @@ from patterned import SHARP, crowded, placed, row
 
 import torchfilm as tf
 from design.targets import Stripe
-from design.targets.border import border
+from design.targets.borders import border
 
 
 def field(

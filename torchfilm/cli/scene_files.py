@@ -152,7 +152,8 @@ def _check_own(made: Any, function: str, path: Path, what: str) -> None:
     code = getattr(inspect.unwrap(made) if callable(made) else made, "__code__", None)
     if code is None or Path(code.co_filename) != path:
         rule = f"a function that {what} defines itself, and that returns a Scene"
-        raise checks.input_error(f"{function} in {what}", made, rule)
+        hint = f"Write def {function}(…): there, also around a partial or a decorated function."
+        raise checks.input_error(f"{function} in {what}", made, rule, hint)
 
 
 def _call(make: Callable[..., Any], name: str, parameters: dict[str, Any]) -> Any:

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchfilm.signals.schedule import Schedule
+from torchfilm.signals.schedule import ROUNDING, Schedule
 from torchfilm.state import State
 from torchfilm.tools import checks, random
-from torchfilm.values import Distribution
+from torchfilm.values import Distribution, PerColony
 
 if TYPE_CHECKING:
     from torchfilm.effects.signal import OnGrid, Signal
@@ -119,7 +119,9 @@ def _drawn(given: Distribution, name: str, what: str, state: State, corner: Corn
     """One draw for each voxel, (nodes,), the same whatever the batch."""
     assert state.layout is not None
     rows = torch.arange(state.layout.grid.nodes, device=state.device)
-    values: Any = SimpleNamespace(**{n: _OfVoxels(getattr(given, n)) for n in given.parameters})
+    plain: Any = lambda x: x.values if isinstance(x, PerColony) else x
+    each = {n: _OfVoxels(plain(getattr(given, n))) for n in given.parameters}
+    values: Any = SimpleNamespace(**each)
     voxels: Any = _Voxels(state, corner)
     return given.draw(voxels, rows, f"{what} of the signal {name}", values)
 
@@ -130,14 +132,40 @@ def without_cells(signal: Signal, name: str, state: State, corner: Corner, time:
     its schedule, if its source has one."""
     value = on_grid(signal, name, "initial", state, corner)
     rate = on_grid(signal, name, "decay", state, corner)
-    begin, source = 0.0, signal.source
-    for end in _until(source, time):
-        now = source.at(begin) if isinstance(source, Schedule) else source
-        made = on_grid(_Given(now), name, "source", state, corner)  # type: ignore[arg-type]
-        kept = torch.exp(-rate * (end - begin))
-        lasted = torch.where(rate > 0, -torch.expm1(-rate * (end - begin)) / rate, end - begin)
-        value, begin = value * kept + made * lasted, end
-    return value
+    source = signal.source
+    given = source if isinstance(source, Schedule) else Schedule({0: source})
+    each = [
+        on_grid(_Given(x), name, "source", state, corner)  # type: ignore[arg-type]
+        for x in given.values.values()
+    ]
+    over = lambda span: _over(given.times, each, rate, value, span)
+    if given.period is None:
+        kept, made = over(time)
+        return value * kept + made
+    whole = int((time + ROUNDING * max(1.0, time)) / given.period)
+    kept, made = over(given.period)
+    rest_kept, rest_made = over(max(0.0, time - whole * given.period))
+    # n periods one after the other: c → aⁿ c + b (1 + a + … + aⁿ⁻¹)
+    again = torch.where(kept < 1, (1 - kept**whole) / torch.where(kept < 1, 1 - kept, 1.0), whole)
+    return (value * kept**whole + made * again) * rest_kept + rest_made
+
+
+def _over(
+    times: Sequence[float], sources: Sequence[Tensor], rate: Tensor, like: Tensor, span: float
+) -> tuple[Tensor, Tensor]:
+    """What is left of one, and what the sources have made, after `span` hours from the first of
+    their times on."""
+    kept, made = torch.ones_like(like), torch.zeros_like(like)
+    some = torch.where(rate > 0, rate, 1.0)  # so that no derivative is NaN either
+    for begin, end, source in zip(times, (*times[1:], span), sources, strict=True):
+        hours = min(end, span) - begin
+        if hours <= 0:
+            continue
+        part = torch.exp(-rate * hours)
+        few = hours - 0.5 * rate * hours**2  # where the rate is 0, with its derivative
+        lasted = torch.where(rate > 0, -torch.expm1(-some * hours) / some, few)
+        kept, made = kept * part, made * part + source * lasted
+    return kept, made
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,13 +173,3 @@ class _Given:
     """The source of a signal while its schedule does not go on."""
 
     source: OnGrid
-
-
-def _until(source: object, time: float) -> list[float]:
-    """When a source changes before a time, and the time."""
-    found = {time} if time > 0 else set()
-    if isinstance(source, Schedule):
-        again = int(time / source.period) + 1 if source.period else 1
-        for k in range(again):
-            found |= {t for x in source.times if 0 < (t := x + k * (source.period or 0.0)) < time}
-    return sorted(found)

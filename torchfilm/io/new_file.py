@@ -6,13 +6,12 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from torchfilm.tools import checks
-from torchfilm.tools.whole_files import telling, umask
+from torchfilm.tools.whole_files import beside, telling
 
 
 def check_new_file(
@@ -75,18 +74,17 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
     what was at `path`. Raises SimulationError where something cannot be written."""
     target = path.resolve()
     with telling(path):
-        beside = Path(tempfile.mkdtemp(".new", f".{target.name}.", target.parent))
-        old = beside.with_suffix(".old")
+        new, old = beside(target, ".new"), beside(target, ".old")
+        new.mkdir()
         try:
-            beside.chmod(0o777 & ~umask())
-            yield beside
+            yield new
             if target.exists():
                 os.replace(target, old)
-            os.replace(beside, target)
+            os.replace(new, target)
         finally:
             if old.exists() and not target.exists():
                 os.replace(old, target)
-            for left in (beside, old):
+            for left in (new, old):
                 shutil.rmtree(left, ignore_errors=True)
 
 

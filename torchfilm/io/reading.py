@@ -22,6 +22,7 @@ from torchfilm.tools.checks import InputError
 # What HDF5 and h5py raise for a damaged file: a MemoryError where it says that it is huge.
 DAMAGE = (
     OSError, KeyError, RuntimeError, ValueError, TypeError, IndexError, MemoryError, OverflowError,
+    AttributeError,
 )  # fmt: skip
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -129,10 +130,10 @@ def open_results(path: Path) -> h5py.File:
             checks.only_own_data(file)
             refresh(file)  # to look at a dataset is to know how long it was then
             check_attributes(file)
-            check_datasets(file)
+            shapes = check_datasets(file)
             if frame_count(file) == 0:
                 raise InputError(f"{path} holds no finished frame.")
-            check_lengths(file, committed(file))
+            check_lengths(file, shapes, committed(file))
     except InputError:
         file.close()
         raise

@@ -123,7 +123,7 @@ class Results(metaclass=checks.KnownKeywords):
     @property
     def settings(self) -> dict[str, Any]:
         """The parameters given to a scene function of the user's own."""
-        return read_attribute(self.file, "settings")
+        return read_attribute(self.file, "settings", "{}")
 
     @property
     def accuracy(self) -> dict[str, float]:

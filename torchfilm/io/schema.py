@@ -79,7 +79,7 @@ ATTRIBUTES: dict[str, Callable[[Any], bool]] = {
     "effects": lambda x: x is None or (isinstance(x, list) and all(map(_is_text, x))),
     "code": lambda x: x is None or isinstance(x, (list, dict, str)),
 }
-NEEDED = ("declared", "recipe", "settings")
+NEEDED = ("declared", "recipe")
 
 
 def _is_text(found: Any) -> bool:
@@ -112,44 +112,57 @@ def check_attributes(file: h5py.File) -> None:
         raise damaged(file, f"its 'dtype' is {file.attrs.get('dtype')!r}")
 
 
-def check_datasets(file: h5py.File) -> None:
-    """Raise InputError for a dataset that is missing or of another kind."""
-    for name, (kinds, axes) in _datasets(file).items():
-        found = file.get(name)
-        if not isinstance(found, h5py.Dataset):
+Shapes = dict[str, tuple[str, tuple[int, ...]]]  # kind of type, and shape, by name
+
+
+def check_datasets(file: h5py.File) -> Shapes:
+    """The kinds and shapes of torchfilm's own datasets, without what others have added. Raises
+    InputError for one that is missing or of another kind."""
+    wanted, found = dict(DATASETS), _shapes(file)
+    declared = json.loads(file.attrs["declared"])
+    for scope, group in (("cell", "cells"), ("colony", "frames/colony")):
+        wanted |= {f"{group}/{n}": (ANY, 0) for n, about in declared.items() if about[2] == scope}
+    if file.get("signals"):
+        wanted |= {f"frames/grid/{n}": about for n, about in GRID.items()}
+        wanted |= {n: (NUMBER, 1) for n in found if n.startswith("signals/")}
+    for name, (kinds, axes) in wanted.items():
+        if name not in found:
             raise damaged(file, f"its {name!r} is missing")
-        if found.dtype.kind not in kinds or (axes and found.ndim != axes) or not found.ndim:
-            shape = "" if not axes else f" along {axes} axes"
-            raise damaged(file, f"its {name!r} does not hold {WORDS[kinds]}{shape}")
-    colonies, dim = len(file["colony_id"]), int(file.attrs["dim"])
+        kind, shape = found[name]
+        if kind not in kinds or (axes and len(shape) != axes) or not shape:
+            along = "" if not axes else f" along {axes} axes"
+            raise damaged(file, f"its {name!r} does not hold {WORDS[kinds]}{along}")
+    colonies, dim = found["colony_id"][1][0], int(file.attrs["dim"])
     for name in ("frames/counts", "frames/next_uid", "stream"):
-        if name in file and file[name].shape[-1] != colonies:
+        if name in found and found[name][1][-1] != colonies:
             raise damaged(file, f"its {name!r} is not of {colonies} colonies")
     for name in ("cells/position", "cells/axis"):
-        if file[name].shape[1] != dim:
+        if found[name][1][1] != dim:
             raise damaged(file, f"its {name!r} is not of {dim} dimensions")
+    return {name: found[name] for name in wanted}
 
 
-def _datasets(file: h5py.File) -> dict[str, tuple[str, int]]:
-    """What the datasets hold that a file must have, and of those that it has besides."""
-    wanted = dict(DATASETS)
-    if "frames/grid" in file:
-        wanted |= {f"frames/grid/{n}": about for n, about in GRID.items()}
-    for group in ROWS:
-        for name, part in file.get(group, {}).items():
+def _shapes(file: h5py.File) -> Shapes:
+    """The kinds and shapes of the datasets in the groups of a results file."""
+    found: Shapes = {}
+    for group in ("/", *ROWS):
+        parts = file.get(group, {})
+        if not isinstance(parts, (h5py.Group, dict)):
+            raise damaged(file, f"its {group!r} is no group")
+        for name, part in parts.items():
             if isinstance(part, h5py.Dataset):
-                wanted.setdefault(f"{group}/{name}", (ANY, 0))
-    return wanted
+                key = name if group == "/" else f"{group}/{name}"
+                found[key] = part.dtype.kind, part.shape
+    return found
 
 
-def check_lengths(file: h5py.File, sizes: Mapping[str, int]) -> None:
-    """Raise InputError for a dataset that is too short. sizes: of the complete part of the file, as
-    `committed` tells them."""
-    for name in _datasets(file):
+def check_lengths(file: h5py.File, shapes: Shapes, sizes: Mapping[str, int]) -> None:
+    """Raise InputError for a dataset that is too short. shapes: of those that must be there. sizes:
+    of the complete part of the file, as `committed` tells them."""
+    for name, (_, shape) in shapes.items():
         group = name.rpartition("/")[0]
-        if group and len(file[name]) < (least := sizes[ROWS[group]]):
-            rows = f"{len(file[name])} rows, and should have {least}"
-            raise damaged(file, f"its {name!r} has {rows}")
+        if group and shape[0] < (least := sizes[ROWS[group]]):
+            raise damaged(file, f"its {name!r} has {shape[0]} rows, and should have {least}")
 
 
 def check_frame(results: Results, frame: int, cells: Mapping[str, np.ndarray]) -> None:

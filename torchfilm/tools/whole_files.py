@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 LOCKED = (errno.EAGAIN, errno.EACCES)
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def why_not_written(error: BaseException) -> str:
@@ -29,42 +30,52 @@ def telling(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if not path.parent.is_dir():
-            why = f"Make the folder {path.parent} first."
-        elif not os.access(path.parent, os.W_OK):
-            why = f"The folder {path.parent} may not be written to."
+        folder = path.parent
+        if not folder.is_dir():
+            why = f" Make the folder {folder} first."
+        elif path.is_dir():
+            why = " There is a folder of this name."
+        elif not os.access(folder, os.W_OK):
+            why = f" The folder {folder} may not be written to."
         else:
-            why = why_not_written(error)
-        raise SimulationError(f"could not write {path}: {error}. {why}") from error
+            why = " Is the disk full?" if error.errno in FULL else ""
+        raise SimulationError(f"could not write {path}: {error}.{why}") from error
 
 
-def umask() -> int:
-    """What the process leaves out of the permissions of new files."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def beside(path: Path, ending: str = "") -> Path:
+    """A path in the same folder, of a name at which nobody can have put a file or a link to one,
+    with the same suffix."""
+    return path.with_name(f".tf-{secrets.token_hex(8)}{ending}{path.suffix}")
 
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
     """Where to write a file, beside `path` and with its suffix, which it replaces at the end. An
-    error or a kill before leaves what was at `path`. Raises SimulationError where the file cannot
-    be written."""
+    error or a kill before leaves what was at `path`. A link stays, and what it leads to is
+    replaced; a device or pipe is written to. Raises SimulationError where the file cannot be
+    written."""
     with telling(path):
-        # of a name at which nobody can have put a file, or a link to one
-        number, name = tempfile.mkstemp(f".new{path.suffix}", f".{path.stem}.", path.parent)
-        os.close(number)
-        beside = Path(name)
+        target = path.resolve()
+        if target.exists() and not target.is_file() and not target.is_dir():
+            yield target
+            return
+        if target.exists() and not os.access(target, os.W_OK):
+            raise PermissionError(errno.EACCES, "it may not be written to")
+        new = beside(target)
+        # exclusive; the system takes off what the process leaves out of permissions
+        os.close(os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         try:
-            yield beside
-            beside.chmod(path.stat().st_mode & 0o777 if path.exists() else 0o666 & ~umask())
-            os.replace(beside, path)
+            yield new
+            if target.exists():
+                with suppress(OSError):  # some file systems know no modes
+                    new.chmod(target.stat().st_mode & 0o777)
+            os.replace(new, target)
         finally:
-            beside.unlink(missing_ok=True)
+            new.unlink(missing_ok=True)
 
 
 def write_whole(path: Path, text: str) -> None:
     """Write a text file whole, in place of an older one. Raises SimulationError where it cannot be
     written."""
-    with written_whole(path) as beside:
-        beside.write_text(text, encoding="utf-8", newline="")
+    with written_whole(path) as new:
+        new.write_text(text, encoding="utf-8", newline="")
