@@ -142,12 +142,15 @@ def without_cells(signal: Signal, name: str, state: State, corner: Corner, time:
     if given.period is None:
         kept, made = over(time)
         return value * kept + made
-    whole = int((time + ROUNDING * max(1.0, time)) / given.period)
-    kept, made = over(given.period)
-    rest_kept, rest_made = over(max(0.0, time - whole * given.period))
-    # n periods one after the other: c → aⁿ c + b (1 + a + … + aⁿ⁻¹)
-    again = torch.where(kept < 1, (1 - kept**whole) / torch.where(kept < 1, 1 - kept, 1.0), whole)
-    return (value * kept**whole + made * again) * rest_kept + rest_made
+    period, n = given.period, int((time + ROUNDING * max(1.0, time)) / given.period)
+    kept, made = over(period)
+    rest_kept, rest_made = over(max(0.0, time - n * period))
+    # n periods one after the other: c → aⁿ c + b (1 + a + … + aⁿ⁻¹), a = exp(−rate · period)
+    some = torch.where(rate > 0, rate, 1.0)
+    sums = torch.expm1(-some * period * n) / torch.expm1(-some * period)
+    few = n - 0.5 * n * (n - 1) * period * rate  # where the rate is 0, with its derivative
+    again = torch.where(rate > 0, sums, few)
+    return (value * kept**n + made * again) * rest_kept + rest_made
 
 
 def _over(
