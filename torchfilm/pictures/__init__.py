@@ -1,10 +1,11 @@
 """Pictures: cells drawn as capsules, coloured by their quantities, over the signal around them.
 
 They require matplotlib (the `app` extra). `show` draws a frame of a results file, or a state,
-`strip` several frames, and `movie` makes a film. `LivePlot` draws a run while it goes on. `overlay`
-draws cells over the micrograph that they were read from. Each picture is a `Picture`, which a
-notebook displays and which is saved where a path is given. For figures of your own, `draw_cells`
-and `draw_signal` draw on matplotlib axes, and `colour_bar` and `scale_bar` add the legends.
+`strip` several frames, `movie` makes a film, and `kymograph` shows a quantity by place and time.
+`LivePlot` draws a run while it goes on. `overlay` draws cells over the micrograph that they were
+read from. Each picture is a `Picture`, which a notebook displays and which is saved where a path is
+given. For figures of your own, `draw_cells` and `draw_signal` draw on matplotlib axes, and
+`colour_bar` and `scale_bar` add the legends.
 """
 
 from torchfilm.pictures.colours import Scale
@@ -15,6 +16,7 @@ from torchfilm.pictures.live import LivePlot
 from torchfilm.pictures.micrograph import overlay
 from torchfilm.pictures.movies import movie
 from torchfilm.pictures.picture import Picture, new_figure
+from torchfilm.pictures.place_and_time import kymograph
 from torchfilm.pictures.shapes import VIEWS, outlines
 
 __all__ = [
@@ -27,6 +29,7 @@ __all__ = [
     "draw_cells",
     "draw_signal",
     "frame_of",
+    "kymograph",
     "movie",
     "new_figure",
     "outlines",

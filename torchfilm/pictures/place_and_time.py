@@ -1,0 +1,119 @@
+"""A kymograph: what cells contain along a coordinate, in the course of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from torchfilm.io.identity import declared_fields
+from torchfilm.io.results import Results
+from torchfilm.pictures.figures import check_not_results, opened
+from torchfilm.pictures.picture import Picture, new_figure
+from torchfilm.spatial import checked_edges
+from torchfilm.state import OUTSIDE
+from torchfilm.tools import checks
+from torchfilm.values import CONCENTRATION
+
+BIN = 1.0  # µm: the default width of a bin, that of a cell
+ALONG = ("x", "y", "z", "radius")
+
+
+@checks.known_keywords
+def kymograph(
+    what: str | Path | Results,
+    quantity: str,
+    *,
+    along: str = "x",
+    edges: Sequence[float] | None = None,
+    colony: int | None = None,
+    limits: tuple[float, float] | None = None,
+    out: str | Path | None = None,
+    dpi: float = 160,
+) -> Picture:
+    """Draw how a quantity of cells changes along a coordinate in the course of a run: place from
+    left to right, time from top to bottom. A field is the mean over the cells in a bin at a
+    recorded frame, and empty without cells.
+
+    what: a results file, or its path. quantity: a field of the cells, or a signal at them as
+    "out.NAME". along: "x", "y", "z", or "radius" from the colony's centre. edges: of the bins, µm,
+    ascending; default bins of 1 µm where there are cells. colony: its id; default the first.
+    limits: the range of colours; default that of the means. out: save the picture there."""
+    with opened(what) as results:
+        check_not_results(results.path, out)
+        checks.choice("along", along, ALONG[: int(results.attributes["dim"])] + ALONG[3:])
+        if len(results) < 2:
+            raise checks.InputError(f"a kymograph needs two frames, and {results.path} has one")
+        ids = results.colony_id.tolist()
+        chosen = ids[0] if colony is None else checks.integer("colony", colony, least=0)
+        if chosen not in ids:
+            raise checks.input_error("colony", colony, f"one of {', '.join(map(str, ids))}")
+        seen = [_seen(results, k, ids.index(chosen), quantity, along) for k in range(len(results))]
+        places = np.concatenate([place for place, _ in seen])
+        if not len(places):
+            raise checks.InputError(f"colony {chosen} of {results.path} has no cell in any frame")
+        bins = _bins(places, edges)
+        grid = np.stack([_means(place, value, bins) for place, value in seen])
+        figure = new_figure(5.0, 4.0, dpi)
+        ax = figure.add_subplot()
+        low, high = (None, None) if limits is None else checks.vector("limits", limits, 2)
+        mesh = ax.pcolormesh(bins, _between(results.times), grid, vmin=low, vmax=high)
+        ax.invert_yaxis()
+        where = "distance from the centre" if along == "radius" else along
+        title = f"{quantity}, colony {chosen}" if len(ids) > 1 else quantity
+        ax.set(xlabel=f"{where}, µm", ylabel="time, h", title=title)
+        unit = _unit(results, quantity)
+        figure.colorbar(mesh, label=f"{quantity}, {unit}" if unit else quantity)
+        return Picture(figure, out)
+
+
+def _between(times: np.ndarray) -> np.ndarray:
+    """Where a frame begins and ends in the picture, (F + 1,) h: half-way to its neighbours."""
+    return np.concatenate([times[:1], 0.5 * (times[1:] + times[:-1]), times[-1:]])
+
+
+def _seen(
+    results: Results, frame: int, place: int, quantity: str, along: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the cells of a colony are, and what they have of the quantity, at a frame, (N,)."""
+    cells, signals = results.frame(frame), results.signals_at_cells(frame)
+    known = {n: x for n, x in cells.items() if x.ndim == 1 and n not in results.internal_fields}
+    known |= {OUTSIDE + n: x for n, x in signals.items()}
+    if quantity not in known:
+        listed = ", ".join(n for n in known if n not in ("uid", "parent", "colony"))
+        raise checks.input_error("quantity", quantity, f"one of {listed}")
+    mine = cells["colony"] == place
+    position, value = cells["position"][mine], known[quantity][mine].astype(float)
+    if along != "radius":
+        return position[:, "xyz".index(along)], value
+    length, radius = (cells[n][mine].astype(float) for n in ("length", "radius"))
+    volume = (np.pi * radius**2 * (length + 4 / 3 * radius))[:, None]
+    centre = (volume * position).sum(0) / volume.sum() if len(position) else 0.0
+    return np.hypot(*(position - centre)[:, :2].T), value
+
+
+def _bins(places: np.ndarray, edges: Sequence[float] | None) -> np.ndarray:
+    """The edges of the bins, (K + 1,) µm."""
+    if edges is None:
+        low, high = np.floor(places.min() / BIN), np.floor(places.max() / BIN) + 1
+        return BIN * np.arange(low, high + 1)
+    return np.array(checked_edges("kymograph", edges))
+
+
+def _means(place: np.ndarray, value: np.ndarray, bins: np.ndarray) -> np.ndarray:
+    """The mean in each bin, (K,); NaN without cells."""
+    at = np.searchsorted(bins, place, side="right") - 1
+    inside = (at >= 0) & (at < len(bins) - 1)
+    count, total = (
+        np.bincount(at[inside], weights, minlength=len(bins) - 1)
+        for weights in (None, value[inside])
+    )
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _unit(results: Results, quantity: str) -> str:
+    if quantity.startswith(OUTSIDE):
+        return CONCENTRATION
+    declared = declared_fields(results.attributes)
+    return "µm" if quantity in ("length", "radius") else str(declared.get(quantity, ["", ""])[1])
