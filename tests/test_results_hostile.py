@@ -298,7 +298,7 @@ def test_a_full_disk_leaves_the_older_file(tmp_path, monkeypatch):
     assert path.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
     write_whole(path, "new")
     assert path.read_text() == "new" and path.stat().st_mode & 0o777 == 0o640
-    with pytest.raises(tf.SimulationError, match=r"Make the folder .*none first"):
+    with pytest.raises(tf.InputError, match=r"in a folder that exists. Make .*none first"):
         write_whole(tmp_path / "none" / "a.json", "new")
     (tmp_path / "folder").mkdir()
     with pytest.raises(tf.SimulationError, match=r"There is a folder of this name\.$"):

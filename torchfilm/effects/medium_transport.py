@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import Binding
-from torchfilm.effects.medium_values import on_grid, without_cells
+from torchfilm.effects.medium_values import Corner, on_grid, without_cells
 from torchfilm.resolver import snapshot
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.grid import Grid, GridBatch
@@ -136,7 +136,7 @@ class Transport:
 
     def first(self, name: str) -> Callable[[State, Tensor], Tensor]:
         """The first values of a signal, as a field's `initial`."""
-        return partial(_first_values, self, name)
+        return partial(_first_values, self.at(0.0).signals[name], name, self.corner)
 
     def values(self, name: str, what: str, state: State) -> Tensor:
         """The initial, source or decay of a signal on every voxel, (nodes,); 0 in obstacles."""
@@ -374,6 +374,5 @@ def held_tensors(function: Callable[..., Any]) -> list[Tensor]:
     return [cell.cell_contents for cell in cells if isinstance(cell.cell_contents, Tensor)]
 
 
-def _first_values(transport: Transport, name: str, state: State, rows: Tensor) -> Tensor:
-    signal = transport.at(0.0).signals[name]
-    return on_grid(signal, name, "initial", state, transport.corner).index_select(0, rows)
+def _first_values(signal: Signal, name: str, corner: Corner, state: State, rows: Tensor) -> Tensor:
+    return on_grid(signal, name, "initial", state, corner).index_select(0, rows)

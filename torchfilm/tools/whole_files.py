@@ -24,19 +24,20 @@ def why_not_written(error: BaseException) -> str:
 
 @contextmanager
 def telling(path: Path) -> Iterator[None]:
-    """Raise SimulationError where something cannot be written for `path`."""
-    from torchfilm.tools.checks import SimulationError  # it offers `write_whole` itself
+    """Raise SimulationError where something cannot be written for `path`, and InputError where its
+    folder does not exist."""
+    from torchfilm.tools.checks import SimulationError, input_error  # it offers `write_whole`
 
+    if not path.parent.is_dir():
+        hint = f"Make {path.parent} first."
+        raise input_error("path", str(path), "in a folder that exists", hint)
     try:
         yield
     except OSError as error:
-        folder = path.parent
-        if not folder.is_dir():
-            why = f" Make the folder {folder} first."
-        elif path.is_dir():
+        if path.is_dir():
             why = " There is a folder of this name."
-        elif not os.access(folder, os.W_OK):
-            why = f" The folder {folder} may not be written to."
+        elif not os.access(path.parent, os.W_OK):
+            why = f" The folder {path.parent} may not be written to."
         else:
             why = " Is the disk full?" if error.errno in FULL else ""
         raise SimulationError(f"could not write {path}: {error}.{why}") from error
