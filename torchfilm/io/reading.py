@@ -69,9 +69,10 @@ def frame_count(file: h5py.File) -> int:
     return count
 
 
-def committed(file: h5py.File) -> dict[str, int]:
-    """The sizes of the complete part of the file: frames, rows, voxels, births, ends."""
-    frames = frame_count(file)
+def committed(file: h5py.File, frames: int | None = None) -> dict[str, int]:
+    """The sizes of the complete part of the file: frames, rows, voxels, births, ends. frames: how
+    many it had when it was asked; a run may have written more since."""
+    frames = frame_count(file) if frames is None else frames
     if frames == 0:
         return {"frames": 0, "rows": 0, "voxels": 0, "births": 0, "ends": 0}
     last = partial(read_dataset, file, at=frames - 1)
@@ -130,10 +131,10 @@ def open_results(path: Path) -> h5py.File:
             checks.only_own_data(file)
             refresh(file)  # to look at a dataset is to know how long it was then
             check_attributes(file)
-            shapes = check_datasets(file)
-            if frame_count(file) == 0:
+            frames = frame_count(file)  # before the lengths of what it counts are looked at
+            if frames == 0:
                 raise InputError(f"{path} holds no finished frame.")
-            check_lengths(file, shapes, committed(file))
+            check_lengths(file, check_datasets(file), committed(file, frames))
     except InputError:
         file.close()
         raise
