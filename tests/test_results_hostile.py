@@ -192,6 +192,7 @@ def change(name, value):
         (change("cells/position", np.inf), "is not finite"),
         (change("cells/axis", np.nan), "is not finite"),
         (change("cells/radius", 0.0), "is below 0"),
+        (change("cells/division_threshold", np.nan), "division threshold is no number"),
         (change("frames/time", np.nan), "its time or step is none"),
     ],
 )

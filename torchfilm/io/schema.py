@@ -30,6 +30,7 @@ DATASETS = {
     **{f"lineage/{t}/{n}": (WHOLE, 1) for t in LINEAGE for n in LINEAGE[t] if n != "length"},
 }
 GRID = {"origin": (NUMBER, 3), "shape": (WHOLE, 3), "first_voxel": (WHOLE, 1)}
+OF_GROWTH = ("growth_rate", "division_threshold")  # fields without which no cell grows or divides
 # How many rows the groups of a file have that belong to its complete frames.
 ROWS = {
     "cells": "rows",
@@ -180,6 +181,8 @@ def check_frame(results: Results, frame: int, cells: Mapping[str, np.ndarray]) -
         wrong = "the place, axis, length or radius of a cell is not finite"
     elif not ((cells["length"] >= 0).all() and (cells["radius"] > 0).all()):
         wrong = "the length or radius of a cell is below 0"
+    elif any(np.isnan(cells[n]).any() for n in OF_GROWTH if n in cells):
+        wrong = "a cell's growth rate or division threshold is no number"
     elif not (np.isfinite(results.times[frame]) and results.steps[frame] >= 0):
         wrong = "its time or step is none"
     if wrong:
