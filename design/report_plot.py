@@ -43,9 +43,8 @@ def draw(report: SearchReport) -> Figure:
     grid = figure.add_gridspec(
         3, columns + 1, width_ratios=[1.0] * columns + [1.5], height_ratios=[1.0, 1.0, 0.05]
     )
-    limits = _limits(
-        target, names, frames[1] or every
-    )  # a bright first guess must not hide the winner
+    # a bright first guess must not hide the winner
+    limits = _limits(target, names, frames[1] or every)
     scales: list[Any] = []
     for row, one in enumerate(designs):
         axes = [figure.add_subplot(grid[row, k]) for k in range(columns)]

@@ -43,10 +43,6 @@ def write_design(path: Path, design: FoundDesign, *, colonies: float) -> Path:
     """Write a design and its losses, and the number of colonies that the search simulated.
     Replaces an older file."""
     task = design.objective.task
-    if not path.parent.is_dir():
-        raise checks.input_error(
-            "path", str(path), "in a folder that exists", f"Make {path.parent} first."
-        )
     recipe = task.tried.recipe
     home = {} if recipe else _home(task.family.function)
     end = {

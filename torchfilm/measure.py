@@ -352,14 +352,14 @@ def profile(
     the x–y plane, "top" as `below_top` has it, or a coordinate of your own, (N,)."""
     value, limits = quantity("profile", state, name), checked_edges("profile", edges)
     if isinstance(along, Tensor):
-        return binned_mean(state, value, quantity("profile", state, along), limits)
+        return binned_mean(state.groups, value, quantity("profile", state, along), limits)
     checks.choice("profile(along)", along, (*"xyz"[: state.dim], "radius", "top"))
     if along == "top":
-        return binned_mean(state, value, below_top(state), limits)
+        return binned_mean(state.groups, value, below_top(state), limits)
     if along != "radius":
-        return binned_mean(state, value, state.position[:, "xyz".index(along)], limits)
+        return binned_mean(state.groups, value, state.position[:, "xyz".index(along)], limits)
     apart = state.position - colony_centre(state).index_select(0, state.colony)
-    return binned_mean(state, value, safe_norm(apart[:, :2].double().T), limits)
+    return binned_mean(state.groups, value, safe_norm(apart[:, :2].double().T), limits)
 
 
 @of_a_state

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
+from torchfilm.tools.ragged import Groups
 
 BLOCK = 2048  # cells whose distances to all others of their colony are in memory at once
 
@@ -56,15 +57,15 @@ def checked_edges(measure: str, edges: Any, least: float = -torch.inf) -> list[f
     return found
 
 
-def binned_mean(state: State, value: Tensor, place: Tensor, edges: Sequence[float]) -> Tensor:
-    """The mean of (N,) over the cells of each colony in each bin, (B, K); NaN in a bin without
-    cells."""
-    bins, count = len(edges) - 1, state.colonies * (len(edges) - 1)
+def binned_mean(groups: Groups, value: Tensor, place: Tensor, edges: Sequence[float]) -> Tensor:
+    """The mean of (N,) over the members of each group in each bin, (G, K); NaN in a bin without
+    any."""
+    bins, count = len(edges) - 1, groups.size * (len(edges) - 1)
     at = torch.bucketize(place, place.new_tensor(edges), right=True) - 1
     inside = torch.nonzero((at >= 0) & (at < bins)).squeeze(1)
-    key = (state.colony * bins + at).index_select(0, inside)
+    key = (groups.owner * bins + at).index_select(0, inside)
     total = torch.bincount(key, value.index_select(0, inside), minlength=count)
-    return (total / torch.bincount(key, minlength=count)).view(state.colonies, bins)
+    return (total / torch.bincount(key, minlength=count)).view(groups.size, bins)
 
 
 def pair_correlation(state: State, value: Tensor, edges: Sequence[float]) -> Tensor:
@@ -94,9 +95,8 @@ def pair_correlation(state: State, value: Tensor, edges: Sequence[float]) -> Ten
 def _distances(state: State, one: Tensor, other: Tensor) -> Tensor:
     """Between places (n, d) and (m, d), (n, m) µm; in a periodic space to the nearest image."""
     square = one.new_zeros(len(one), len(other))
-    periods = [0.0] * one.shape[1] if state.space is None else state.space.period
-    for k, period in enumerate(periods):
+    for k in range(one.shape[1]):
         x = one[:, k, None] - other[:, k]
-        x = x - period * torch.floor(x / period + 0.5) if period else x
+        x = x if state.space is None else x + state.space.shift_along(k, x)
         square += x * x
     return square.sqrt()

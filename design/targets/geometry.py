@@ -86,25 +86,14 @@ def periodic_along(state: tf.State, axes: str) -> str:
     return " and ".join(a for a in axes if state.space is not None and a in state.space.faces)
 
 
-def nearest_image(state: tf.State, apart: Tensor) -> Tensor:
-    """Differences of places along x and y, (N, 2) µm; where space is periodic, to the nearest
-    image."""
-    if state.space is None:
-        return apart
-    columns = []
-    for k, period in enumerate(state.space.period[:2]):
-        x = apart[:, k]
-        columns.append(x - period * torch.floor(x / period + 0.5) if period else x)
-    return torch.stack(columns, 1)
-
-
 def offset(state: tf.State, centre: Centre) -> Tensor:
     """The position of each cell relative to the centre, (N, 2) float64 µm, without gradient; of a
     cell in a periodic space that of its image that is nearest to the centre."""
     place = state.position.detach()[:, :2]
     if centre == "colony":
         return place - tf.measure.colony_centre(state)[:, :2].index_select(0, state.colony)
-    return nearest_image(state, place - place.new_tensor(centre))
+    apart = place - place.new_tensor(centre)
+    return apart if state.space is None else apart + state.space.shift(apart.T).T
 
 
 def coordinate(state: tf.State, along: str, centre: Centre) -> Tensor:

@@ -208,13 +208,20 @@ class BoundReactions(BoundEffect):
     @torch.no_grad()
     def _acts(self, state: State) -> bool:
         """Whether a signal changes at its first concentrations, in some voxels of all colonies."""
-        count = self._nodes(state)
-        rows = torch.arange(count, device=state.device)[:: max(1, count // TRIED)]
+        rows = self._some_voxels(state)
         first = torch.stack(
             [state.fields[OUTSIDE + n].index_select(0, rows) for n in self.species], 1
         )
         changes, _ = self._voxels(state, None).changes(first, rows)
         return any(bool((rate != 0).any()) for rate in changes.values())
+
+    def _some_voxels(self, state: State) -> Tensor:
+        """A few voxels of all colonies, in none of which is an obstacle, (M,) int64."""
+        assert state.layout is not None
+        mask = state.layout.mask
+        every = torch.arange(self._nodes(state), device=state.device)
+        inside = every if mask is None else torch.nonzero(mask).squeeze(1)
+        return inside[:: max(1, len(inside) // TRIED)][:TRIED]
 
     def _listed(self, reactions: Sequence[Reaction], signals: Sequence[str]) -> None:
         used = {n for r in reactions for n in (*r.consumes, *r.produces)}
@@ -231,11 +238,7 @@ class BoundReactions(BoundEffect):
     def _try(self, rates: Rates, signals: Sequence[str], state: State) -> None:
         """Call the function on some voxels of the medium: with the concentrations at first, with
         others, and with those of one voxel alone."""
-        assert state.layout is not None
-        mask = state.layout.mask
-        every = torch.arange(self._nodes(state), device=state.device)
-        inside = every if mask is None else torch.nonzero(mask).squeeze(1)
-        rows = inside[:: max(1, len(inside) // TRIED)][:TRIED]  # of all colonies
+        rows = self._some_voxels(state)
         read: set[str] = set()
         seen: set[str] = set()
         first = {n: state.fields[OUTSIDE + n].index_select(0, rows) for n in signals}

@@ -29,11 +29,11 @@ from torchfilm.state import OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import why_torch
 from torchfilm.tools.tangents import tracked
-from torchfilm.values import numbers
+from torchfilm.values import Distribution, numbers
 
 if TYPE_CHECKING:
     from torchfilm.effects.medium import Medium
-    from torchfilm.effects.signal import Flow, Signal
+    from torchfilm.effects.signal import Flow, OnGrid, Signal
 
 # Methods that are exact over a step, whatever its length.
 EXACT = ("exponential", "series")
@@ -136,11 +136,12 @@ class Transport:
 
     def first(self, name: str) -> Callable[[State, Tensor], Tensor]:
         """The first values of a signal, as a field's `initial`."""
-        return partial(_first_values, self.at(0.0).signals[name], name, self.corner)
+        return partial(_first_values, self.at(0.0).signals[name].initial, name, self.corner)
 
     def values(self, name: str, what: str, state: State) -> Tensor:
         """The initial, source or decay of a signal on every voxel, (nodes,); 0 in obstacles."""
-        return on_grid(self.at(state.time).signals[name], name, what, state, self.corner)
+        given = getattr(self.at(state.time).signals[name], what)
+        return on_grid(given, name, what, state, self.corner)
 
     def without_cells(self, name: str, state: State, dt: float) -> Tensor:
         """What a signal has become on every voxel as cells are about to find it in a step of dt
@@ -374,5 +375,7 @@ def held_tensors(function: Callable[..., Any]) -> list[Tensor]:
     return [cell.cell_contents for cell in cells if isinstance(cell.cell_contents, Tensor)]
 
 
-def _first_values(signal: Signal, name: str, corner: Corner, state: State, rows: Tensor) -> Tensor:
-    return on_grid(signal, name, "initial", state, corner).index_select(0, rows)
+def _first_values(
+    given: OnGrid | Distribution, name: str, corner: Corner, state: State, rows: Tensor
+) -> Tensor:
+    return on_grid(given, name, "initial", state, corner).index_select(0, rows)

@@ -23,10 +23,12 @@ Corner = Sequence[float]
 BITS = 21  # of the number of a voxel along an axis, in its key
 
 
-def on_grid(signal: Signal, name: str, what: str, state: State, corner: Corner) -> Tensor:
-    """The initial, source or decay of a signal on every voxel, (nodes,); 0 in obstacles. corner: of
-    the medium's box, from which voxels are counted where their values are drawn."""
-    given: OnGrid = getattr(signal, what)
+def on_grid(
+    given: OnGrid | Distribution, name: str, what: str, state: State, corner: Corner
+) -> Tensor:
+    """The initial, source or decay of a signal, as it is given, on every voxel, (nodes,); 0 in
+    obstacles. name, what: of the signal and of the value. corner: of the medium's box, from which
+    voxels are counted where their values are drawn."""
     layout = state.layout
     assert layout is not None
     if isinstance(given, Distribution):
@@ -130,14 +132,11 @@ def without_cells(signal: Signal, name: str, state: State, corner: Corner, time:
     """What a signal has become on every voxel at a time, h, (nodes,), where nothing moved it and no
     cell was near: the solution of dc/dt = source − decay · c from its first values. signal: with
     its schedule, if its source has one."""
-    value = on_grid(signal, name, "initial", state, corner)
-    rate = on_grid(signal, name, "decay", state, corner)
+    value = on_grid(signal.initial, name, "initial", state, corner)
+    rate = on_grid(signal.decay, name, "decay", state, corner)
     source = signal.source
     given = source if isinstance(source, Schedule) else Schedule({0: source})
-    each = [
-        on_grid(_Given(x), name, "source", state, corner)  # type: ignore[arg-type]
-        for x in given.values.values()
-    ]
+    each = [on_grid(x, name, "source", state, corner) for x in given.values.values()]
     over = lambda span: _over(given.times, each, rate, value, span)
     if given.period is None:
         kept, made = over(time)
@@ -169,10 +168,3 @@ def _over(
         lasted = torch.where(rate > 0, -torch.expm1(-some * hours) / some, few)
         kept, made = kept * part, made * part + source * lasted
     return kept, made
-
-
-@dataclass(frozen=True, eq=False)
-class _Given:
-    """The source of a signal while its schedule does not go on."""
-
-    source: OnGrid

@@ -113,12 +113,16 @@ class PeriodicSpace:
     @torch.no_grad()
     def shift(self, between: Tensor) -> Tensor:
         """What leads from the second point of each pair to its image that is nearest to the first,
-        (d, P) µm. between: (d, P), from the first to the second."""
-        moves = torch.zeros_like(between)
-        for k, period in enumerate(self.period):
-            if period:
-                moves[k] = -period * torch.floor(between[k] / period + 0.5)
-        return moves
+        (d, P) µm. between: (d, P), from the first to the second; or its first axes alone."""
+        return torch.stack([self.shift_along(k, x) for k, x in enumerate(between)])
+
+    @torch.no_grad()
+    def shift_along(self, k: int, between: Tensor) -> Tensor:
+        """As `shift`, along one axis, of any shape."""
+        period = self.period[k]
+        if not period:
+            return torch.zeros_like(between)
+        return -period * torch.floor(between / period + 0.5)
 
     @torch.no_grad()
     def images(self, position: Tensor, side: Tensor, groups: Groups) -> Images:

@@ -359,9 +359,6 @@ def save(figure: Figure, path: str | Path) -> Path:
     Raises InputError if the format or the folder is not valid.
     """
     path = check_picture_path(path)
-    if not path.parent.is_dir():
-        hint = f"Make {path.parent} first."
-        raise checks.input_error("picture", str(path), "in a folder that exists", hint)
     with written_whole(path) as beside:
         figure.savefig(beside, dpi=figure.dpi)
     return path

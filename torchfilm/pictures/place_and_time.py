@@ -6,14 +6,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from torchfilm.io.identity import declared_fields
 from torchfilm.io.results import Results
+from torchfilm.physics import capsule
 from torchfilm.pictures.figures import check_not_results, opened
 from torchfilm.pictures.picture import Picture, new_figure
-from torchfilm.spatial import checked_edges
+from torchfilm.spatial import binned_mean, checked_edges
 from torchfilm.state import OUTSIDE
 from torchfilm.tools import checks
+from torchfilm.tools.ragged import Groups
 from torchfilm.values import CONCENTRATION
 
 BIN = 1.0  # µm: the default width of a bin, that of a cell
@@ -53,8 +56,11 @@ def kymograph(
         places = np.concatenate([place for place, _ in seen])
         if not len(places):
             raise checks.InputError(f"colony {chosen} of {results.path} has no cell in any frame")
-        bins = _bins(places, edges)
-        grid = np.stack([_means(place, value, bins) for place, value in seen])
+        bins, values = _bins(places, edges), np.concatenate([value for _, value in seen])
+        frame = np.repeat(np.arange(len(seen)), [len(place) for place, _ in seen])
+        groups = Groups(torch.from_numpy(frame), len(seen), ordered=True)
+        value, place = torch.from_numpy(values), torch.from_numpy(places)
+        grid = binned_mean(groups, value, place, bins.tolist()).numpy()
         figure = new_figure(5.0, 4.0, dpi)
         ax = figure.add_subplot()
         low, high = (None, None) if limits is None else checks.vector("limits", limits, 2)
@@ -87,8 +93,8 @@ def _seen(
     position, value = cells["position"][mine], known[quantity][mine].astype(float)
     if along != "radius":
         return position[:, "xyz".index(along)], value
-    length, radius = (cells[n][mine].astype(float) for n in ("length", "radius"))
-    volume = (np.pi * radius**2 * (length + 4 / 3 * radius))[:, None]
+    size = (torch.from_numpy(cells[n][mine].astype(float)) for n in ("length", "radius"))
+    volume = capsule.volume(*size).numpy()[:, None]
     centre = (volume * position).sum(0) / volume.sum() if len(position) else 0.0
     return np.hypot(*(position - centre)[:, :2].T), value
 
@@ -99,17 +105,6 @@ def _bins(places: np.ndarray, edges: Sequence[float] | None) -> np.ndarray:
         low, high = np.floor(places.min() / BIN), np.floor(places.max() / BIN) + 1
         return BIN * np.arange(low, high + 1)
     return np.array(checked_edges("kymograph", edges))
-
-
-def _means(place: np.ndarray, value: np.ndarray, bins: np.ndarray) -> np.ndarray:
-    """The mean in each bin, (K,); NaN without cells."""
-    at = np.searchsorted(bins, place, side="right") - 1
-    inside = (at >= 0) & (at < len(bins) - 1)
-    count, total = (
-        np.bincount(at[inside], weights, minlength=len(bins) - 1)
-        for weights in (None, value[inside])
-    )
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def _unit(results: Results, quantity: str) -> str:
