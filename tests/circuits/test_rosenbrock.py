@@ -292,7 +292,7 @@ def test_nothing_to_do(device, dtype):
     assert array(grown) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("count", [2, 7, 33, 200])
+@pytest.mark.parametrize("count", [2, 33, 150])
 def test_a_row_is_its_own(dtype, count):
     """Bitwise the same alone, in any batch and at any position, for easy and stiff rows.
 

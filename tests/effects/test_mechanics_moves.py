@@ -149,7 +149,7 @@ def test_a_heap_drives_no_cell_through_a_wall(backend, contacts):
     ids=["floor", "post", "chamber"],
 )
 def test_both_paths_cut_the_same_moves_at_walls(dim, wall):
-    """Two steps of heaps at walls, of one pass each."""
+    """Two steps of heaps at walls, of one pass each: two heaps, and more until a move is cut."""
     if isinstance(wall, tf.Sphere):
         wall = tf.Sphere(wall.center[:dim], wall.radius, inside=wall.inside)
     no_limit = lambda self, at, made: torch.ones_like(self.given.radius)
@@ -159,7 +159,7 @@ def test_both_paths_cut_the_same_moves_at_walls(dim, wall):
         mock.patch.object(_OneStep, "_share_to_hard_walls", no_limit),
     )
     farther = 0.0
-    for seed in (1, 3, 4, 5):
+    for number, seed in enumerate((1, 4, 5, 3)):
         ends = []
         for backend, limit in zip(("compiled", "torch", "torch"), none, strict=True):
             model, state = heap([wall], dim, seed, passes=1, tolerance=1e-6, backend=backend)
@@ -170,6 +170,8 @@ def test_both_paths_cut_the_same_moves_at_walls(dim, wall):
         clipped = [s.reports["mechanics"].clipped.item() for s in ends]
         assert clipped[0] == clipped[1] > 0
         farther = max(farther, float((without.position - other.position).abs().max()))
+        if number and farther > 0.01:
+            break
     assert farther > 0.01, "no move was cut"
 
 

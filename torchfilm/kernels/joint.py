@@ -30,7 +30,9 @@ def put_gained(more, gained, c):
     """What one of the grids of a shape gains without cells, of (b or 1 or 0, voxels)."""
     more[:] = 0.0
     if gained.shape[0] > 0:
-        more[:] = gained[c if gained.shape[0] > 1 else 0]
+        own = gained[c if gained.shape[0] > 1 else 0]
+        for v in range(more.size):  # (Numba compiles an assignment of arrays with all its messages)
+            more[v] = own[v]
 
 
 @kernel
