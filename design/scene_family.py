@@ -121,17 +121,15 @@ def scene_function(scene: Callable[..., tf.Scene] | str) -> Callable[..., tf.Sce
 class TriedScenes:
     """What the trial of a family's scenes found.
 
-    founders: cells at the start of a colony; placed: whether the founders of each colony are given;
-    dt (h): of the scene. recipe: name and arguments of a ready scene, or None. listing: its effects
-    as text. digest: of what a listing does not show, the founders and the code of functions.
-    why_regrown: the reason why colonies cannot follow recorded growth, or "". why_rough: the reason
-    why losses have no exact derivatives, with one option of a choice at least, or "". stochastic:
-    whether circuits count molecules one by one. idle: parameters on which nothing in the scene
-    depends.
+    founders: cells at the start of a colony. dt (h): of the scene. recipe: name and arguments of a
+    ready scene, or None. listing: its effects as text. digest: of what a listing does not show, the
+    founders and the code of functions. why_regrown: the reason why colonies cannot follow recorded
+    growth, or "". why_rough: the reason why losses have no exact derivatives, with one option of a
+    choice at least, or "". stochastic: whether circuits count molecules one by one. idle:
+    parameters on which nothing in the scene depends.
     """
 
     founders: int
-    placed: bool
     dt: float
     recipe: tuple[str, Any] | None
     listing: list[str]
@@ -167,6 +165,13 @@ def try_scenes(
         try:
             # two colonies: a tensor with one number would pass for a plain number
             scene = family.scene([values], repeat=2)
+            if scene.founders.colony is not None:
+                raise checks.input_error(
+                    "founders",
+                    "cells with colony numbers",
+                    "cells of one colony",
+                    "Each colony of a search starts from them: leave colony out.",
+                )
             tried = colonies.try_scene(
                 scene, 2, seed=seed, dtype=dtype, device=family.device, replay=replay, cells=cells
             )
@@ -192,7 +197,6 @@ def try_scenes(
     ready = scene.recipe and family.function is tf.scenes.READY.get(scene.recipe[0])
     return TriedScenes(
         founders=int(scene.founders.count),
-        placed=scene.founders.colony is not None,
         dt=scene.dt,
         recipe=scene.recipe if ready else None,
         listing=scene.listing(),

@@ -108,7 +108,7 @@ class Task(TaskOptions):
             dtype=self.dtype,
             replay=self.replay,
         )
-        if self.cells is not None and self.cells <= tried.founders and not tried.placed:
+        if self.cells is not None and self.cells <= tried.founders:
             raise checks.input_error(
                 "cells", self.cells, f"above the {tried.founders} that a colony starts from"
             )

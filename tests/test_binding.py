@@ -236,6 +236,32 @@ def test_an_effect_that_looks_for_divisions_too_early_is_warned_of(stage, divisi
     assert len(said) == (late > 0) and all(x.startswith(wanted) for x in said)
 
 
+@pytest.mark.parametrize(("stage", "removal"), [(95, True), (85, True), (95, False)])
+def test_rows_of_births_are_not_read_after_cells_are_gone(stage, removal):
+    @dataclass(frozen=True)
+    class Look(tf.Effect):
+        title = "look"
+
+        def step(self, state, dt, values):
+            for births in state.births:
+                assert state.uid[births.first].tolist() == births.uid[: len(births.first)].tolist()
+            return state
+
+    Look.stage = stage
+    gone = [tf.Removal(low=(-3.0, -9.0))] if removal else []
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics(dim=2), Look(), *gone
+    )
+    if stage == 95 and removal:
+        with pytest.raises(
+            tf.InputError, match=r"removal removes cells .* 90: .* Write stage = 85"
+        ):
+            scene.bind()
+        return
+    *_, state = tf.simulate(scene, until=3.0)
+    assert state.cells > 4
+
+
 def test_descriptions_with_keywords_of_their_own_can_be_replaced():
     """Of `Medium` and `Circuit`, whose signals and constants are keywords."""
     medium = tf.Medium(ahl=tf.Signal(10.0), box=((-8, -8), (8, 8)), spacing=4.0, depth=2.0)

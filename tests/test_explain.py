@@ -113,7 +113,7 @@ def test_a_way_of_transport_that_was_asked_for_is_reported(method):
                 "bilateral",
                 "α = 0.1/γ = 0.01 (default)",
                 "at most 1 a step",
-                "residual of 0.05 (default)",
+                "residual of 0.005 (default)",
                 "at most 2000 iterations",
             ),
         ),
@@ -408,3 +408,25 @@ def test_how_far_a_signal_reaches_beside_the_voxels(signal, words):
     scene = tf.Scene(box, dim=2, founders=tf.Cells([[8.0, 8.0]], [[1.0, 0.0]]))
     told = str(tf.explain(scene, seconds=0))
     assert words in told if words else "reaches" not in told
+
+
+@pytest.mark.parametrize("speed", [30.0, 400.0, 0.5])
+def test_what_voxels_add_to_diffusion_where_it_flows(speed):
+    """Said as it is: the variance of a pulse grows by 2 (K + what they add) t."""
+    pulse = lambda at: torch.exp(-0.5 * ((at[:, 0] + 80.0) / 8.0) ** 2)
+    medium = tf.Medium(
+        m=tf.Signal(10.0, initial=pulse), box=((-200, -2), (200, 2)), spacing=2.0,
+        flow=(speed, 0.0), boundary=tf.BoundaryConditions(x=tf.NoFlux(), y=tf.NoFlux()),
+    )  # fmt: skip
+    scene = tf.Scene(medium, dim=2, founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]]), dt=0.02)
+    found = re.search(r"m: voxels add ([\d.]+) µm²/h .* along x", str(tf.explain(scene, seconds=0)))
+    if speed < 1:
+        assert found is None
+        return
+    first = scene.bind(dtype=torch.float64).start()
+    *_, last = tf.simulate(scene, first, until=0.2)
+    x = first.layout.grid.centres()[:, 0].double()
+    mean = lambda s, of: float((s.signals["m"] * of).sum() / s.signals["m"].sum())
+    variance = lambda s: mean(s, (x - mean(s, x)) ** 2)
+    grown = (variance(last) - variance(first)) / (2 * 0.2)
+    assert grown - 10.0 == pytest.approx(float(found[1]), rel=0.02)

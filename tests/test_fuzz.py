@@ -24,6 +24,7 @@ pytestmark = pytest.mark.filterwarnings(
     "ignore:.*there is room for",
     "ignore:.*between two hard sides, too narrow",
     "ignore:.*the box grows through the wall",
+    "ignore:.*its signal .* count as none",
 )
 
 # Of each seed so many are drawn, each by itself; workers share the seeds.

@@ -131,20 +131,39 @@ def _few(values: Tensor) -> str:
     return ", ".join(f"{x:g}" for x in each[:4]) + (", …" if len(each) > 4 else "")
 
 
-def warn_of_early(effects: Sequence[BoundEffect]) -> None:
-    """Warn of a user's effect that looks for divisions of the step before cells divide."""
+def check_births(effects: Sequence[BoundEffect]) -> None:
+    """Of a user's effect that looks for the divisions of the step: warn where cells divide later;
+    raise InputError where others may have removed cells since, so that rows are of other cells."""
     for bound in (e for e in effects if is_own(e.effect)):
-        code = getattr(type(bound.effect).step, "__code__", None)
-        if code is None or "births" not in code.co_names:
+        if not _calls(type(bound.effect), "births"):
             continue
+        name = type(bound.effect).__name__
         divide = max((e.stage for e in effects if _divides(e)), default=bound.stage)
         if bound.stage < divide:
-            name = type(bound.effect).__name__
             warn(
                 f"{name} reads state.births at stage {bound.stage:g}, and cells divide at stage"
                 f" {divide:g}: it finds no divisions. Write stage = {divide + 5:g}, or another"
                 f" number above {divide:g}, in {name}."
             )
+        between = [e for e in effects if divide < e.stage < bound.stage and _removes(e)]
+        if between:
+            first = min(between, key=lambda e: e.stage)
+            raise checks.InputError(
+                f"{name} reads state.births at stage {bound.stage:g}, and {first.title} removes"
+                f" cells before it, at stage {first.stage:g}: the rows of state.births are those"
+                f" right after the divisions. Write stage = {(divide + first.stage) / 2:g}, or"
+                f" another number between {divide:g} and {first.stage:g}, in {name}."
+            )
+
+
+def _calls(kind: type, name: str) -> bool:
+    """Whether a method of a class reads an attribute of this name."""
+    methods = (getattr(x, "__code__", None) for x in vars(kind).values())
+    return any(code is not None and name in code.co_names for code in methods)
+
+
+def _removes(effect: BoundEffect) -> bool:
+    return any(_calls(kind, "remove") for kind in (type(effect), type(effect.effect)))
 
 
 def _divides(effect: BoundEffect) -> bool:

@@ -157,6 +157,8 @@ class Together:
             changed[OUTSIDE + name] = end.to(old.dtype)
             overdrawn = overdrawn + beyond.detach()
             wanted = wanted + total(released.detach().clamp(max=0.0).neg())
+            # a signal that has run out is solved for to `finest`, of which this may be a part, too
+            wanted = wanted + self.finest * total(step.transport[name].pool)
             if f"{name}_reservoir" in state.fields:
                 away = total(torch.where(step.fed, 0.0, released))
                 changed[f"{name}_reservoir"] = state.fields[f"{name}_reservoir"] + away

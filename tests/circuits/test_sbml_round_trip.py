@@ -46,11 +46,13 @@ CIRCUITS = {
     "names": lambda: tf.Circuit.from_antimony("species x; x' = -path*x; x = 1; path = 2"),
 }  # fmt: skip
 
+CELL = {"functions": {"growth_rate": 0.7}}  # what a circuit reads of a cell beside its shape
+
 
 @pytest.mark.parametrize("name", CIRCUITS)
 def test_a_circuit_comes_back_as_it_was(name, tmp_path):
     path, circuit = tmp_path / "written.xml", CIRCUITS[name]()
-    circuit.to_sbml(path)
+    circuit.to_sbml(path, cell=CELL.get(name))
     again = tf.Circuit.from_sbml(path)
     assert str(again.graph) == str(circuit.graph)
     assert again.species == circuit.species and again.diluted_fields == circuit.diluted_fields
@@ -65,15 +67,16 @@ def test_a_circuit_comes_back_as_it_was(name, tmp_path):
 @pytest.mark.parametrize("name", CIRCUITS)
 def test_what_was_read_is_written_as_the_same_file(name, tmp_path):
     """The first file may have 0.1·r where torch, reading it, notes r·0.1."""
-    CIRCUITS[name]().to_sbml(tmp_path / "0.xml")
+    CIRCUITS[name]().to_sbml(tmp_path / "0.xml", cell=CELL.get(name))
     for k in (1, 2):
-        tf.Circuit.from_sbml(tmp_path / f"{k - 1}.xml").to_sbml(tmp_path / f"{k}.xml")
+        read = tf.Circuit.from_sbml(tmp_path / f"{k - 1}.xml")
+        read.to_sbml(tmp_path / f"{k}.xml", cell=CELL.get(name))
     assert (tmp_path / "1.xml").read_text() == (tmp_path / "2.xml").read_text()
 
 
 @pytest.mark.parametrize("name", CIRCUITS)
 def test_what_is_written_is_valid(name, tmp_path):
-    CIRCUITS[name]().to_sbml(tmp_path / "written.xml")
+    CIRCUITS[name]().to_sbml(tmp_path / "written.xml", cell=CELL.get(name))
     document = libsbml.readSBML(str(tmp_path / "written.xml"))
     document.setConsistencyChecks(libsbml.LIBSBML_CAT_UNITS_CONSISTENCY, False)
     document.checkConsistency()
@@ -114,6 +117,22 @@ def test_rates_of_one_cell_type_are_written(tmp_path):
     assert again.graph.equations == "d k/dt = k" and again.parameters == {"k": 2.0}
 
 
+def test_what_is_read_of_a_cell_is_a_number_of_the_file(tmp_path):
+    circuit = tf.Circuit(
+        lambda u, s, p, cell: {"gfp": cell.plasmid * cell.length - u.gfp}, species="gfp"
+    )
+    path = tmp_path / "a.xml"
+    with pytest.raises(tf.InputError, match=r"read cell\.plasmid, .*: give cell=\{'plasmid': …\}"):
+        circuit.to_sbml(path)
+    with pytest.raises(tf.InputError, match=r"cell\.plasmids is not read .* mean 'plasmid'"):
+        circuit.to_sbml(path, cell={"plasmids": 3.0})
+    assert not path.exists()
+    circuit.to_sbml(path, cell={"plasmid": 3.0})
+    model = libsbml.readSBML(str(path)).getModel()
+    numbers = {x.getId(): x.getValue() for x in model.getListOfParameters()}
+    assert numbers == {"cell_plasmid": 3.0, "cell_length": 2.0}
+
+
 def test_letters_that_sbml_lacks_are_refused(tmp_path):
     circuit = tf.Circuit(lambda u, s, p, cell: {"β": 0 * u["β"]}, species="β")
     with pytest.raises(tf.InputError, match="'β' cannot be written"):
@@ -133,7 +152,7 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
 
 def test_a_changed_function_is_not_torchfilms(tmp_path):
     """The name of a function does not decide what it computes."""
-    CIRCUITS["functions"]().to_sbml(tmp_path / "a.xml")
+    CIRCUITS["functions"]().to_sbml(tmp_path / "a.xml", cell=CELL["functions"])
     text = (tmp_path / "a.xml").read_text()
     start = text.index('id="torchfilm_sigmoid"')
     changed = text[:start] + text[start:].replace("<cn>1.0</cn>", "<cn>2</cn>", 1)

@@ -205,3 +205,13 @@ def test_warnings_of_a_scene_name_the_users_line():
     with pytest.warns(UserWarning, match="a constant that no rate reads") as found:
         Task(unread, [Parameter("make", 0.5, 2.0)], OnFraction("gfp", 0.5, 1.0), cells=4)
     assert {w.filename for w in found} == {__file__}
+
+
+def test_founders_of_numbered_colonies_are_refused():
+    """A batch of a search has other colonies than these: all but the first would have no cells."""
+
+    def numbered(make):
+        return lit(make).replace(founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], colony=[0]))
+
+    with pytest.raises(tf.InputError, match=r"founders = .*cells of one colony.*leave colony out"):
+        search(scene=numbered)

@@ -391,3 +391,39 @@ def test_a_circuit_that_is_starved_by_monod_is_warned_of():
     list(tf.simulate(breathing(gives, q, K, 100.0), until=0.05, dt=0.025))
     gentle = monod, tf.Growth(), tf.Circuit(eating, species="dm", q=2.0, K=K)
     list(tf.simulate(breathing(gentle, q, K, 1e6), until=0.05, dt=0.025))
+
+
+def eats(u, s, p, cell):
+    """Fast, and not at all where there is nothing."""
+    taken = p.most * s.ahl / (s.ahl + p.half)
+    return {"eaten": taken / p.unit}, {"ahl": -taken * cell.volume}
+
+
+def eating_scene(unit: float, diffusion: float, cells=SIX, **circuit) -> tf.Scene:
+    numbers = {"most": 1e3 * unit, "half": 0.05 * unit, "unit": unit, **circuit}
+    made = tf.Circuit(eats, species="eaten", **numbers)
+    return resting(medium(diffusion, decay=0.0, initial=unit), made, cells)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64], ids=str)
+@pytest.mark.parametrize("backend", [None, "torch"])
+def test_cells_may_eat_all_there_is(dtype, backend):
+    """Down to where numbers end: what is left then is less than the solve looks at."""
+    made = eating_scene(1.0, 1e5, backend=backend)
+    first = made.bind(dtype=dtype).start()
+    whole = float(first.signals["ahl"].double().sum()) * first.layout.grid.voxel_volume
+    for state in tf.simulate(made, first, until=40 * DT, dt=DT):
+        assert float(state.signals["ahl"].min()) >= 0.0
+    assert float(state.signals["ahl"].max()) < 1e-20
+    eaten = float((state.eaten.double() * state.volume.double()).sum())
+    assert eaten == pytest.approx(whole, rel=1e-5)
+
+
+def test_signals_in_too_large_a_unit_are_warned_of():
+    """nM in M: all of it is less than the solve looks at. With the advice it is as in nM."""
+    with pytest.warns(UserWarning, match=r"its signal 'ahl' is of about 1e-09.*Give atol=1e-15"):
+        eating_scene(1e-9, 50.0).bind()
+    nano = advance(made := eating_scene(1.0, 50.0), made.bind(dtype=F64).start(), 5, DT)
+    made = eating_scene(1e-9, 50.0, atol=1e-15)
+    molar = advance(made, made.bind(dtype=F64).start(), 5, DT)
+    torch.testing.assert_close(molar.eaten, nano.eaten, rtol=1e-3, atol=0.0)

@@ -335,7 +335,7 @@ def test_nearly_hard_contacts_converge_in_32_bits(alpha, contacts):
     report = step(scene, seeded(scene, cells, "cpu", torch.float32), 0.005).reports["mechanics"]
     assert int((report.status == CONVERGED).sum()) >= 16
     if contacts == "bilateral":  # one-sided ones are solved as softer ones first
-        assert float(report.iterations.double().median()) < 60
+        assert float(report.iterations.double().median()) < 200  # one that stagnates takes 500
 
 
 @pytest.mark.parametrize("passes", [1, 2, 3])

@@ -249,6 +249,17 @@ def test_a_nutrient_that_is_used_up():
     assert food(state) < 1e-3 * food(start) and float(state.growth_rate.max()) < 0.05
 
 
+@pytest.mark.parametrize("backend", [None, "torch"])
+@pytest.mark.parametrize("flow", [None, (1.0, 0.0)])
+def test_what_is_left_may_be_next_to_no_number(backend, flow):
+    """Squares of what is left lie below all numbers, which once counted as no convergence."""
+    made = scene(diffusion=2e6, half=1e-3, growth_yield=1e-3, flow=flow, backend=backend)
+    state = advance(made, made.bind(dtype=F64).start(), 1, 0.05)
+    left = state.with_fields(**{"out.food": state.fields["out.food"] * 1e-150})
+    again = advance(made, left, 4, 0.05)
+    assert 0.0 <= float(again.signals["food"].max()) <= 1e-150
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 @pytest.mark.parametrize("backend", [None, "torch"])
 def test_food_without_limit(dtype, backend):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import array, crowd, growth, mechanics, pair_gaps, seeded, step
+from scipy.integrate import solve_ivp
 
 import torchfilm as tf
 from torchfilm.kernels.compiling import for_python
@@ -219,3 +220,29 @@ def test_alpha_follows_the_mean_overlap_and_the_few_that_are_far_above_it(worst,
     by_peaks = hardness * most / np.mean(e**8) ** 0.125
     assert (by_peaks < by_mean) == peaks
     assert found == pytest.approx(min(by_mean, by_peaks, 2 * hardness), rel=1e-12)
+
+
+@CONTACTS
+@pytest.mark.parametrize("dt", [0.025, 0.00625])
+def test_three_cells_in_a_row_push_as_rigid_ones_do(contacts, dt):
+    """Forces f₁ and f₂ keep both gaps closed: d ẋ = ±f with the drag d = μ(l + 2r) of each cell,
+    and γ(l̇ − g(l + 4r/3)) = −(the mean of what presses its ends). Bilateral solves that stopped at
+    a worst residual of 0.05 lost 14 % of what the middle cell grows."""
+
+    def rates(t, y):
+        drag, free = y[3:] + 1.0, y[3:] + 2 / 3
+        # motion by each force, and what it takes off growth; a gap is x₂ − x₁ − (l₁ + l₂)/2 − 2r
+        move = np.array([[-1, 0], [1, -1], [0, 1]]) / drag[:, None]
+        longer = -np.array([[1, 0], [1, 1], [0, 1]]) / (2 * 10.0)
+        of_gap = move[1:] - move[:-1] - (longer[:-1] + longer[1:]) / 2
+        force = np.linalg.solve(of_gap, (free[:-1] + free[1:]) / 2)
+        return np.concatenate([move @ force, free + longer @ force])
+
+    x, length = [-3.0, 0.0, 3.5], [1.0, 3.0, 2.0]
+    row = tf.Cells([[a, 0.0] for a in x], [[1.0, 0.0]] * 3, length, 0.5)
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Mechanics(dim=2, contacts=contacts, length_drag=10.0), founders=row
+    )
+    *_, state = tf.simulate(scene, until=0.5, dt=dt)
+    right = solve_ivp(rates, (0.0, 0.5), [*x, *length], rtol=1e-9, atol=1e-9).y[3:, -1]
+    assert array(state.length) == pytest.approx(right, rel=0.01)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import torch
@@ -70,7 +70,7 @@ def try_circuit(
                     f" ({at}): every rate must be a finite number."
                 )
     if atol is not None:
-        _check_size(circuit, concentrations, inside, atol)
+        _check_size(circuit, concentrations, inside, outside, atol)
     if isinstance(circuit.part, Network):
         exchanged = {
             n.removeprefix("out.")
@@ -98,22 +98,43 @@ def _check_alone(
 
 
 def _check_size(
-    circuit: CircuitCells, concentrations: Tensor, inside: Mapping[str, Tensor], atol: float
-) -> None:
+    circuit: CircuitCells, concentrations: Tensor, inside: Mapping[str, Tensor],
+    outside: Mapping[str, Tensor], atol: float,
+) -> None:  # fmt: skip
     """Warn where species are so small, at first and by what an hour makes, that their errors count
-    as nothing."""
-    largest = lambda found: max(float(x.detach().abs().max()) for x in found if x.numel())
-    small = lambda size: 0 < SMALL * size < atol <= ATOL
+    as nothing; or a signal at first that cells take."""
     size = largest([concentrations, *inside.values()])
     # a signal may repress at first, and less where cells have taken it up
-    for part in FALLEN if small(size) and circuit.signals else ():
+    for part in FALLEN if is_small(size, atol) and circuit.signals else ():
         around = {name: part * value for name, value in circuit.signals.items()}
         fallen, _ = replace(circuit, signals=around).changes(concentrations, circuit.rows)
         size = max(size, largest(fallen.values()))
-    if small(size):
+    warn_if_small(circuit.label, "species", size, "Circuit.atol", atol)
+    for name, given in outside.items():
+        # a signal that cells give, or make inside, may rise from nothing
+        given_by_none = name not in circuit.species and not bool((given.detach() > 0).any())
+        if name in circuit.signals and given_by_none:
+            size = largest([circuit.signals[name]])
+            warn_if_small(circuit.label, f"signal {name!r}", size, "Circuit.atol", atol)
+
+
+def largest(found: Iterable[Tensor]) -> float:
+    """The largest size of all numbers."""
+    return max((float(x.detach().abs().max()) for x in found if x.numel()), default=0.0)
+
+
+def is_small(size: float, atol: float) -> bool:
+    """Whether errors of concentrations of this size count as nothing, and nobody has wished so."""
+    return 0 < SMALL * size < atol <= ATOL
+
+
+def warn_if_small(label: str, what: str, size: float, name: str, atol: float) -> None:
+    """Warn where errors of such concentrations count as nothing. name: of `atol`."""
+    if is_small(size, atol):
         warn(
-            f"{circuit.label}: its species are of about {size:.0e}, and errors below Circuit.atol ="
-            f" {atol:.0e} count as none. Give atol={1e-3 * SMALL * size:.0e}, or concentrations in"
-            " a smaller unit, such as nM in place of M.",
+            f"{label}: its {what} {'are' if what.endswith('s') else 'is'} of about {size:.0e}, and"
+            f" errors below {name} = {atol:.0e} count as none. Give"
+            f" atol={1e-3 * SMALL * size:.0e}, or concentrations in a smaller unit, such as nM in"
+            " place of M.",
             of=SMALL_SPECIES,
         )

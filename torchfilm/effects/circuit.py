@@ -225,6 +225,7 @@ class Circuit(Effect):
         cell_type: int | None = None,
         initial: Mapping[str, float] | None = None,
         dilution: float | None = None,
+        cell: Mapping[str, float] | None = None,
         **values: float,
     ) -> None:
         """Write the equations as an SBML model (Level 3 Version 2), in hours. `from_sbml` reads
@@ -232,12 +233,12 @@ class Circuit(Effect):
 
         cell_type: whose rates and constants, where they differ. initial, and further keywords:
         numbers by name in place of first values and constants that are not one number. dilution:
-        1/h; the rates then contain −dilution · x, for programs whose cells do not grow. Raises
-        InputError where a number is missing, and where rates cannot be written as equations.
-        """
+        1/h; the rates then contain −dilution · x, for programs whose cells do not grow. cell: what
+        the rates read of a cell, by name, beside its shape. Raises InputError where a number is
+        missing, and where rates cannot be written as equations."""
         from torchfilm.effects import circuit_sbml
 
-        circuit_sbml.write_file(path, self, cell_type, initial or {}, dilution, values)
+        circuit_sbml.write_file(path, self, cell_type, initial or {}, dilution, cell or {}, values)
 
     @property
     def title(self) -> str:  # type: ignore[override]

@@ -152,6 +152,7 @@ def write_file(
     cell_type: int | None,
     initial: Mapping[str, float],
     dilution: float | None,
+    cell: Mapping[str, float],
     values: Mapping[str, float],
 ) -> None:
     """Write a circuit's equations as an SBML model; see `Circuit.to_sbml`."""
@@ -180,5 +181,25 @@ def write_file(
         circuit.name or label_of(part),
         *written_numbers(circuit, cell_type, initial, values),
         [n for n in circuit.species if n not in diluted],
+        _numbers_of_cell(sbml.read_of_cell(graph), cell),
     )
     sbml.write(path, text)
+
+
+def _numbers_of_cell(names: Sequence[str], given: Mapping[str, float]) -> dict[str, float]:
+    """What rates read of a cell, by name: numbers that are given, or those of a usual cell. Raises
+    InputError for names that are not read, and where a number is missing."""
+    if not isinstance(given, Mapping):
+        raise checks.input_error("cell", given, 'numbers by name, such as {"growth_rate": 1.0}')
+    for name, value in given.items():
+        if name not in names:
+            raise checks.InputError(unknown(f"cell.{name} is not read by the rates", name, names))
+        checks.number(f"cell[{name!r}]", value)
+    found = {**sbml.usual_cell(), **given}
+    if lacking := [n for n in names if n not in found]:
+        give = ", ".join(f"{n!r}: …" for n in lacking)
+        raise checks.InputError(
+            f"the rates read {', '.join(f'cell.{n}' for n in lacking)}, and a model has one number"
+            f" for each: give cell={{{give}}}."
+        )
+    return {n: float(found[n]) for n in names}

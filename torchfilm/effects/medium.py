@@ -20,7 +20,7 @@ from torchfilm.effects.bound_medium import (
     GridCoverage,
 )
 from torchfilm.effects.medium_transport import EXACT, Transport
-from torchfilm.effects.signal import Flow, Signal, check_boundary, reach_of, velocity
+from torchfilm.effects.signal import Flow, Signal, check_boundary, reach_of, smear_of, velocity
 from torchfilm.parameters import number_range
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.exchange import turns_error
@@ -306,6 +306,7 @@ class Medium(Effect):
         lines += [f"{n}: moved together with {coupled[n]}, see there" for n in sorted(coupled)]
         for name, signal in self.signals.items():
             lines += reach_of(name, signal, finest)
+            lines += smear_of(name, signal, self.flow_of(name), spacing)
             if name in coupled:
                 continue
             whole = not self.halves or (name in exchanged and self.steps > 1)

@@ -3,6 +3,7 @@ faces."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -24,6 +25,7 @@ OnGrid = float | Tensor | Callable[[Tensor], Tensor]
 Flow = Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
 
 
+SMEARED = 0.1  # of its own diffusion, that voxels add where it flows
 RESOLVED = 2.0  # voxels in the reach of a signal, below which its profile is coarse
 
 
@@ -80,6 +82,30 @@ def reach_of(name: str, signal: Signal, spacing: float) -> list[str]:
     voxels = float(reach.min()) / spacing
     few = "" if voxels >= RESOLVED else f": {voxels:.2g} voxels, too few to resolve it"
     return [f"{name} reaches √(K/k) = {number_range(reach)} µm{few}"]
+
+
+def smear_of(name: str, signal: Signal, flow: Any, spacing: Sequence[float]) -> list[str]:
+    """What the voxels add to the diffusion of a signal that flows, as a line: along the axis where
+    it is most. None where it is little, and where the flow is not numbers.
+
+    Between voxels the flux is that of a steady profile, as by K_h = (v h/2) coth(v h/2K).
+    """
+    if not isinstance(flow, tuple) or not any(bool((torch.as_tensor(v) != 0).any()) for v in flow):
+        return []
+    own, found = torch.as_tensor(signal.diffusion).double().reshape(-1), []
+    for axis, v, h in zip("xyz", flow, spacing, strict=False):
+        half = (torch.as_tensor(v).double().abs() * (h / 2)).reshape(-1)
+        pairs = zip(*(x.tolist() for x in torch.broadcast_tensors(half, own)), strict=True)
+        spread = lambda x, k: x / math.tanh(x / k) - k if k > 0 else x
+        found += [(spread(x, k), k, x, axis) for x, k in pairs if x > 0]
+    more, k, half_most, axis = max(found)
+    if more <= SMEARED * k:
+        return []
+    times = f", {more / k:.2g} times its own" if k > 0 else ""
+    return [
+        f"{name}: voxels add {more:.3g} µm²/h to its diffusion along {axis}{times}, since it flows"
+        f" by v·h = {2 * half_most:.3g} µm²/h; in proportion to their size"
+    ]
 
 
 def _number(name: str, given: Any) -> Any:

@@ -13,6 +13,9 @@ from torchfilm.kernels.transport import exchanged
 
 # Rows that a solve works in.
 SPARE = 7
+# Squares of numbers below SMALL may be below all numbers: they are solved for so many times as
+# large, which changes no digit.
+SMALL, LARGER = 1e-100, 2.0**600
 
 
 @kernel(any_order=True)
@@ -102,11 +105,30 @@ def bicgstab(x, r, pad, grid, many, inverse, target, most, spare):
 
 
 @kernel
+def _is_small(b, x):
+    most = 0.0
+    for i in range(b.size):
+        most = max(most, abs(b[i]), abs(x[i]))
+    return 0.0 < most < SMALL
+
+
+@kernel
+def _times(factor, b, x, r):
+    for i in range(b.size):
+        b[i] *= factor
+        x[i] *= factor
+        r[i] *= factor
+
+
+@kernel
 def backward_euler(x, b, r, pad, grid, many, tolerance, rounding, symmetric, most, spare):
     """Solve (I + many (I − P)) x = b for one grid, from x, and leave the residual in r. Whether it
     converged. tolerance: of the residual over b. rounding: times many, over x. spare: `SPARE` rows,
     0 in their padding."""
     inverse, stay, inner = spare[6, pad : pad + b.size], grid[1], x[pad : pad + b.size]
+    small = _is_small(b, inner)
+    if small:
+        _times(LARGER, b, inner, r)
     for i in range(b.size):
         inverse[i] = 1 / (1 + many * (1 - stay[i]))
     for trial in range(4):
@@ -121,7 +143,10 @@ def backward_euler(x, b, r, pad, grid, many, tolerance, rounding, symmetric, mos
             conjugate_gradients(x, r, pad, grid, many, inverse, target, most, spare)
         else:
             bicgstab(x, r, pad, grid, many, inverse, target, most, spare)
-    return dot(r, r) <= 100 * target
+    good = dot(r, r) <= 100 * target
+    if small:
+        _times(1 / LARGER, b, inner, r)
+    return good
 
 
 @kernel(entry=True)

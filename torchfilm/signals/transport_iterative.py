@@ -28,6 +28,7 @@ Map = Callable[[Tensor], Tensor]
 # voxel in a step, relative to that of the solution, since these are rounded.
 TOLERANCE = 1e-10
 ROUNDING = 1e-15
+SMALL, LARGER = 1e-100, 2.0**600  # as in `kernels.transport_solve`
 MAX_ITERATIONS = 2000
 
 
@@ -211,6 +212,9 @@ def krylov(
     The residual is at most TOLERANCE of b, or its `rounding` (B or 1,) of x. inverse: of the
     diagonal of A. No gradient.
     """
+    most = torch.maximum(b.abs(), start.abs()).amax((1, 2, 3), keepdim=True)
+    up = torch.ones_like(most).masked_fill((most > 0) & (most < SMALL), LARGER)
+    b, start = b * up, start * up
     size = _dot(b, b)
     least = rounding.reshape(-1, 1, 1, 1) ** 2
     x, iterations = start.clone(), torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
@@ -228,7 +232,9 @@ def krylov(
     target = torch.maximum(TOLERANCE**2 * size, least * _dot(x, x))
     residual = _ratio(_dot(r, r), size).sqrt().reshape(-1)
     # a right-hand side of zero has the solution zero; a NaN never converges
-    return x, TransportSolveReport(iterations, residual, (_dot(r, r) <= 100 * target).reshape(-1))
+    return x / up, TransportSolveReport(
+        iterations, residual, (_dot(r, r) <= 100 * target).reshape(-1)
+    )
 
 
 def _conjugate_gradients(

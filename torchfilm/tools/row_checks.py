@@ -38,7 +38,7 @@ def no_such_part(
         near = f"It is position[:, {'xyz'.index(name)}]."
     return AttributeError(
         f"the state has no {name!r}. {near + ' ' if near else ''}Beside {', '.join(per_cell)} it"
-        f" has the fields {', '.join(fields) or 'none'}."
+        f" has the fields {', '.join(fields) or 'none'}. An effect names what it reads in reads()."
     )
 
 

@@ -36,7 +36,7 @@ ELEMENTS = {
 FLAT = ("add", "mul")  # written with all operands at once, so that long sums are not nested
 
 
-def _cell(radius: float = 0.5, length: float = 2.0) -> dict[str, float]:
+def usual_cell(radius: float = 0.5, length: float = 2.0) -> dict[str, float]:
     """A cell for other programs: what formulas of cells read."""
     return {
         "volume": math.pi * radius**2 * (length + 4 / 3 * radius),
@@ -78,15 +78,16 @@ def sbml_text(
     initial: Mapping[str, float],
     constants: Mapping[str, float],
     undiluted: Iterable[str],
+    cell: Mapping[str, float],
 ) -> str:
-    """A circuit as the text of an SBML model. initial, constants: numbers by name.
+    """A circuit as the text of an SBML model. initial, constants, and what is read of a cell:
+    numbers by name.
 
     Rates are rate rules; what a cell gives to a signal is a reaction whose product is that signal.
     Raises InputError for names and equations that SBML cannot hold.
     """
     ids = Ids()
-    roots = [*graph.rates.values(), *graph.releases.values()]
-    leaves = list(dict.fromkeys(e.name for e in walk(roots) if e.op == NAME))
+    roots, leaves = _read(graph)
     ids.add("cell.volume", "cell")
     for name in graph.species:
         ids.add(f"u.{name}", name)
@@ -94,9 +95,8 @@ def sbml_text(
         ids.add(f"p.{name}", name)
     for name in graph.signals:
         ids.add(f"s.{name}", f"out_{name}")
-    cell = [n for n in leaves if n.startswith("cell.") and n not in ("cell.volume", "cell.time")]
-    for name in cell:
-        ids.add(name, name.replace(".", "_"))
+    for name in read_of_cell(graph):
+        ids.add(f"cell.{name}", f"cell_{name}")
     top = Element("sbml", {"xmlns": CORE, "level": "3", "version": "2"})
     model = SubElement(top, "model", {
         "id": label if SID.fullmatch(label) else "circuit", "timeUnits": "hour",
@@ -108,7 +108,7 @@ def sbml_text(
     _compartments(model, ids, graph)
     _species(model, ids, graph, initial)
     parameters = [(ids.of[f"p.{n}"], constants[n]) for n in graph.parameters]
-    parameters += [(ids.of[n], _cell().get(n.partition(".")[2], 0.0)) for n in cell]
+    parameters += [(ids.of[f"cell.{n}"], cell[n]) for n in read_of_cell(graph)]
     _list(model, "parameter", ({"id": i, "value": _attribute(x), "constant": "true"}
                                for i, x in parameters))  # fmt: skip
     rules = _list(model, "rule", ())
@@ -120,6 +120,18 @@ def sbml_text(
     _reactions(model, ids, graph)
     ElementTree.indent(top)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(top, "unicode") + "\n"
+
+
+def _read(graph: CircuitGraph) -> tuple[list[Expression], list[str]]:
+    """All rates, and the names that they read."""
+    roots = [*graph.rates.values(), *graph.releases.values()]
+    return roots, list(dict.fromkeys(e.name for e in walk(roots) if e.op == NAME))
+
+
+def read_of_cell(graph: CircuitGraph) -> list[str]:
+    """What the rates read of a cell, beside its volume and the time."""
+    names = [n.removeprefix("cell.") for n in _read(graph)[1] if n.startswith("cell.")]
+    return [n for n in names if n not in ("volume", "time")]
 
 
 def write(path: str | Path, text: str) -> None:
@@ -177,7 +189,7 @@ def _units(model: Element) -> None:
 
 
 def _compartments(model: Element, ids: Ids, graph: CircuitGraph) -> None:
-    sizes = {ids.of["cell.volume"]: _cell()["volume"]}
+    sizes = {ids.of["cell.volume"]: usual_cell()["volume"]}
     if graph.signals:
         sizes[ids.add("medium", "medium")] = MEDIUM_SIZE
     _list(model, "compartment", (
