@@ -135,9 +135,9 @@ def _why_endless(model: tf.Model, first: tf.State, cells: int) -> str:
     return ""
 
 
-def first_state(scene: tf.Scene, dtype: torch.dtype) -> tf.State:
-    """The first state of one colony, on the CPU."""
-    return scene.bind(dtype=dtype, device="cpu", per_colony=True).start()
+def first_state(scene: tf.Scene, dtype: torch.dtype, count: int = 1) -> tf.State:
+    """The first state of so many colonies, on the CPU."""
+    return scene.bind(count, dtype=dtype, device="cpu", per_colony=True).start()
 
 
 def grid_nodes(first: tf.State) -> int:

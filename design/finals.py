@@ -206,15 +206,15 @@ def winner(task: Task, study: Study, sizes: Sequence[float]) -> np.ndarray | Non
 class FinalsRun:
     """The finals of one run of a search.
 
-    budget: colonies of the whole search; executor, work_items: as in `Objective.evaluate`. What is
-    chosen depends on the study and the budget alone, and what the study holds is not grown again.
-    So a stopped run goes on where it was.
+    budget: colonies of the whole search, under each condition; executor, work_items: as in
+    `Objective.evaluate`. What is chosen depends on the study and the budget alone, and what the
+    study holds is not grown again. So a stopped run goes on where it was.
     """
 
     finals: Finals
     task: Task
     study: Study
-    budget: int
+    budget: float
     executor: Executor | None = None
     work_items: int = 1
 
@@ -321,7 +321,7 @@ class FinalsRun:
         return sum(size * max(0, seeds - n) for size, n in known.items())
 
     def _affords(self, cost: float) -> bool:
-        return self.study.colonies + cost <= self.budget + 1e-9
+        return self.study.colonies / self.task.conditions + cost <= self.budget + 1e-9
 
     def _add(self, points: np.ndarray, size: float, seeds: range) -> None:
         objective = Objective(self.task if size == 1.0 else self.task.resized(size))

@@ -145,7 +145,8 @@ class Objective(metaclass=checks.KnownKeywords):
     def copies(self, slopes: bool) -> int:
         """Colonies that are grown for each loss."""
         moving = len(self.task.space.moving)
-        return 1 if not slopes else 1 + 2 * moving if self.why_differences else moving
+        of_slopes = 1 if not slopes else 1 + 2 * moving if self.why_differences else moving
+        return of_slopes * self.task.conditions
 
     def _grow(
         self,
@@ -180,7 +181,7 @@ class Objective(metaclass=checks.KnownKeywords):
             if found.slopes is not None:
                 gathered.put([row * count + k for row in rows for k in range(count)], found.slopes)
         slopes = None if tangents is None else gathered.reduced(task.shares(losses))
-        copies = 1 if tangents is None else len(tangents[0])
+        copies = task.conditions if tangents is None else len(tangents[0])
         return Evaluation(
             points, values, losses, task.reduced(losses), cells, reasons, size, why_regrown, 0.0,
             slopes, copies, task.reduced_goals(goals), goals if task.goals else None,
@@ -200,7 +201,8 @@ class Objective(metaclass=checks.KnownKeywords):
         return replace(
             found,
             points=points, values=found.values[first], losses=found.losses[first],
-            loss=found.loss[first], cells=found.cells[first], slopes=slopes, copies=each,
+            loss=found.loss[first], cells=found.cells[first], slopes=slopes,
+            copies=each * found.copies,
             goals=None if found.goals is None else found.goals[first],
             each_goals=None if found.each_goals is None else found.each_goals[first],
             reasons={(r // each, k): w for (r, k), w in found.reasons.items() if not r % each},

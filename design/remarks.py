@@ -53,7 +53,7 @@ def remark_on_end(task: Task, study: Study, method: Method, colonies: int, holds
     remark = getattr(method, "remark", "")
     if remark and not holds:
         print(remark, file=sys.stderr)
-    each = task.replicates
+    each = task.colonies_each
     if sum(len(e.points) for e in study.entries) == 1 and colonies < 2 * each:
         counted = displays.counted
         print(

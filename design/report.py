@@ -297,7 +297,8 @@ def each_measured(target: Target, finished: Iterable[FinishedColonies]) -> dict[
     found: dict[str, list[float]] = {}
     for part in finished:
         for name, value in target.measures(part.state, part.history).items():
-            found.setdefault(name, []).extend(value.double().tolist())
+            mine = target.concerns(name, part.state)
+            found.setdefault(name, []).extend(value.double()[mine].tolist())
     return found
 
 

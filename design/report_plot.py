@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SHOWN = 3  # replicates side by side
+SHOWN = 3  # replicates side by side, or one under so many conditions
+MOST_SHOWN = 6
 # losses of which the largest is so many times the smallest are drawn by their logarithms
 WIDE = 100.0
 
@@ -28,9 +29,10 @@ def draw(report: SearchReport) -> Figure:
     """Draw the first guess above and the best design below, with the target over each colony, and
     the course of the search beside them. Needs matplotlib (the `app` extra)."""
     designs = (report.first, report.best)
-    grown = [_one_by_one(d.colonies)[:SHOWN] for d in designs]
+    target, conditions = report.task.target, report.task.conditions
+    shown = SHOWN if conditions == 1 else min(conditions, MOST_SHOWN)
+    grown = [_one_by_one(d.colonies)[:shown] for d in designs]
     columns = max(1, *(len(g) for g in grown))
-    target = report.task.target
     names = _shown(target, report.best.colonies)
     frames = [[_cells(d.state, k, names) for d, k in g] for g in grown]
     every = [cells for row in frames for cells in row]
@@ -173,9 +175,10 @@ def _draw_row(
         )
         target.draw(ax, done.state, k, done.history)
         tf.pictures.scale_bar(ax)
-        ax.set_title(
-            title if ax is axes[0] else f"replicate {int(done.state.colony_id[k])}", fontsize=9
-        )
+        number = int(done.state.colony_id[k])
+        under = target.label(number % len(target.arguments))
+        first = f"{title}\n{under}" if under else title
+        ax.set_title(first if ax is axes[0] else target.caption(number), fontsize=9)
     for ax in axes[len(grown) :]:
         ax.set_visible(False)
     return scales if names else []

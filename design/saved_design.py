@@ -54,7 +54,8 @@ def write_design(path: Path, design: FoundDesign, *, colonies: float) -> Path:
         "torchfilm": tf.__version__,
         "scene": recipe[0] if recipe else home["function"],
         **home,
-        "parameters": {**task.family.fixed, **design.values},
+        # under the first condition, if there are several
+        "parameters": {**task.family.fixed, **design.values, **task.target.arguments[0]},
         **end,
         "seed": task.seed,
         "dt": task.dt,
@@ -72,6 +73,7 @@ def write_design(path: Path, design: FoundDesign, *, colonies: float) -> Path:
             "replicates": task.replicates,
             "reduce": task.reduce,
             "replay": task.replay,
+            "conditions": list(task.target.arguments[0]),
             "losses": design.searched.tolist(),
         },
     }
@@ -203,12 +205,22 @@ class SavedDesign:
         names = self.content["search"]["names"] if "search" in self.content else every
         return {name: every[name] for name in names}
 
-    def scene(self) -> tf.Scene:
-        """The scene with these parameters, for one colony or any number of them. Warns where it is
-        not the one that was scored."""
-        made = self.function(**self.content["parameters"])
+    def scene(self, **arguments: float) -> tf.Scene:
+        """The scene with these parameters, for one colony or any number of them. Of several
+        conditions under the first, or under the `arguments` that are given. Warns where it is not
+        the one that was scored."""
+        if wrong := [n for n in arguments if n not in self._under]:
+            under = ", ".join(self._under) or "nothing: it was searched under one condition"
+            raise checks.input_error("scene", wrong[0], f"an argument of its conditions: {under}")
+        given = self.content["parameters"]
+        made = self.function(**given)
         made.warn_if_not(self.path, self.content)
-        return made
+        return self.function(**{**given, **arguments}) if arguments else made
+
+    @property
+    def _under(self) -> list[str]:
+        """The arguments by which the conditions differ, under which it was searched."""
+        return self.content.get("search", {}).get("conditions", [])
 
     @property
     def options(self) -> dict[str, Any]:
@@ -239,7 +251,11 @@ class SavedDesign:
         target = self.target
         every, names = self.content["parameters"], self._search["names"]
         options: dict[str, Any] = {
-            "fixed": {name: value for name, value in every.items() if name not in names},
+            "fixed": {
+                name: value
+                for name, value in every.items()
+                if name not in names and name not in target.arguments[0]
+            },
             **{name: self._search[name] for name in ("replicates", "reduce", "replay")},
             **{name: self.content.get(name) for name in ("cells", "until", "dt", "seed")},
         }

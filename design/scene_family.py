@@ -33,13 +33,14 @@ class SceneFamily:
     """All scenes of a task.
 
     function: from parameters to a `tf.Scene`; fixed: its further arguments; device: of the values
-    that it receives.
+    that it receives. conditions: further arguments; each replicate has a colony under each.
     """
 
     function: Callable[..., tf.Scene]
     space: Space
     fixed: Mapping[str, Any]
     device: str
+    conditions: Sequence[Mapping[str, float]] = ({},)
 
     @property
     def name(self) -> str:
@@ -52,10 +53,14 @@ class SceneFamily:
         tangents: Sequence[Mapping[str, float]] | None = None,
     ) -> tf.Scene:
         """One scene for several designs whose structure is the same. A number, or a choice that is
-        made per colony, becomes one value per colony; each design has `repeat` colonies. tangents:
-        for each design, the derivatives that its values carry, by name; those that are not named
-        carry 0."""
-        arguments = dict(self.fixed)
+        made per colony, becomes one value per colony; each design has `repeat` colonies under each
+        condition, those of all conditions side by side. tangents: for each design, the derivatives
+        that its values carry, by name; those that are not named carry 0."""
+        arguments, replicates = dict(self.fixed), len(values) * repeat
+        repeat *= len(self.conditions)
+        for name in self.conditions[0]:
+            given = [condition[name] for condition in self.conditions]
+            arguments[name] = self._column(given * replicates, 1)
         for parameter in self.space.parameters:
             name = parameter.name
             if parameter.structural:
@@ -90,6 +95,16 @@ class SceneFamily:
                         f"a parameter of {self.name}: {', '.join(allowed)}",
                         checks.suggestion(given, allowed),
                     )
+            for given in self.conditions[0]:
+                if given not in allowed:
+                    rule = f"a parameter of {self.name}: {', '.join(allowed)}"
+                    hint = checks.suggestion(given, allowed)
+                    raise checks.input_error("Conditions", given, rule, hint)
+        named = (*self.space.names, *self.fixed)
+        if twice := [name for name in self.conditions[0] if name in named]:
+            raise checks.input_error(
+                "Conditions", twice[0], "a parameter that is neither searched nor fixed"
+            )
         both = [name for name in self.fixed if name in self.space.names]
         if both:
             raise checks.input_error("fixed", both[0], "a parameter that is not searched as well")
@@ -160,7 +175,10 @@ def try_scenes(
     made_of: dict[int, Any] = {}  # by the number of the trial
     endless, unfit, rough = [], [], []
     example: tf.Scene | None = None
-    stochastic = False
+    stochastic, under = False, len(family.conditions)
+    attempt = lambda scene, count, cells: colonies.try_scene(
+        scene, count, seed=seed, dtype=dtype, device=family.device, replay=replay, cells=cells
+    )
     for k, values in enumerate(trials):
         try:
             # two colonies: a tensor with one number would pass for a plain number
@@ -172,9 +190,7 @@ def try_scenes(
                     "cells of one colony",
                     "Each colony of a search starts from them: leave colony out.",
                 )
-            tried = colonies.try_scene(
-                scene, 2, seed=seed, dtype=dtype, device=family.device, replay=replay, cells=cells
-            )
+            tried = attempt(scene, 2 * under, cells)
         except UnfitDesign as error:
             unfit.append(str(error))
             continue
@@ -190,9 +206,7 @@ def try_scenes(
     if example is None or all(endless):
         raise tf.InputError(unfit[0] if example is None else endless[0])
     scene = example
-    why_regrown = colonies.try_scene(
-        scene, 1, seed=seed, dtype=dtype, device=family.device, replay=replay, cells=None
-    ).why_regrown
+    why_regrown = attempt(scene, under, None).why_regrown
     # a function that calls a ready scene has parameters of its own, so it is not that scene
     ready = scene.recipe and family.function is tf.scenes.READY.get(scene.recipe[0])
     return TriedScenes(
@@ -258,7 +272,13 @@ def why_rough_together(family: SceneFamily, *, seed: int, dtype: torch.dtype, re
         try:
             scene = family.scene([values], repeat=2)
             tried = colonies.try_scene(
-                scene, 2, seed=seed, dtype=dtype, device=family.device, replay=replay, cells=None
+                scene,
+                2 * len(family.conditions),
+                seed=seed,
+                dtype=dtype,
+                device=family.device,
+                replay=replay,
+                cells=None,
             )
         except Exception:
             continue

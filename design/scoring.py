@@ -68,7 +68,7 @@ def cut_work_items(
     whole = WorkItem(
         tuple(range(len(values))), tuple(values), None if tangents is None else tuple(tangents)
     )
-    colonies_each = replicates * (1 if tangents is None else len(tangents[0]))
+    colonies_each = replicates * (task.conditions if tangents is None else len(tangents[0]))
     structural = [p.name for p in task.space.parameters if p.structural]
     groups: dict[tuple[str, ...], list[int]] = {}
     for row, design in enumerate(values):
@@ -117,7 +117,8 @@ def _max_colonies(task: Task, values: Sequence[dict[str, Value]], size: float, s
     for design in values:
         # the scene may refuse a design; the first that it accepts shows the grid
         with contextlib.suppress(tf.InputError):
-            first = colonies.first_state(task.family.scene([design]), task.dtype)
+            scene = task.family.scene([design])
+            first = colonies.first_state(scene, task.dtype, task.conditions)
             nodes, founders = colonies.grid_nodes(first), task.tried.founders
             each = task.target.kept(first) if slopes else 0.0
             notes = memory.kept_notes(each, founders, cells, until, cast(float, task.dt))
@@ -170,14 +171,15 @@ def _goals(task: Task, part: WorkResult, replicates: int) -> np.ndarray:
 def _grow_and_score(
     task: Task, item: WorkItem, streams: tuple[int, ...], size: float
 ) -> WorkResult:
-    """Copies of a colony, one for each derivative, stand side by side in the batch."""
-    count, replicates = len(item.rows), len(streams)
+    """Copies of a colony, one for each derivative, stand side by side in the batch; or those of a
+    replicate, one under each condition, which have no derivatives."""
+    count, replicates = len(item.rows), len(streams) * task.conditions
     copies = 1 if item.tangents is None else len(item.tangents[0])
     with tf.tangents.forward_mode() if item.tangents else contextlib.nullcontext():
-        scene = _scene(task, item, replicates)
+        scene = _scene(task, item, len(streams))
         prepared = colonies.prepare(
             scene,
-            [stream for _ in item.rows for stream in streams for _ in range(copies)],
+            [s for _ in item.rows for s in streams for _ in range(task.conditions * copies)],
             task.settings,
         )
         if item.tangents and why_rough(scene, prepared.why_regrown):
@@ -212,10 +214,26 @@ def _grow_and_score(
                 gathered.add(task.target, event, ids)
                 gathered.forget([k for k, well in zip(ids, good, strict=True) if not well])
     shape, slopes = (count, replicates), None if gathered is None else gathered.slopes
-    return WorkResult(
+    found = WorkResult(
         losses.reshape(shape), cells.reshape(shape), reasons, prepared.why_regrown, slopes,
         goals.reshape(*shape, task.goals),
     )  # fmt: skip
+    return found if task.conditions == 1 else _of_replicates(task, found)
+
+
+def _of_replicates(task: Task, found: WorkResult) -> WorkResult:
+    """The result of replicates (n, R), from that of their colonies, one under each condition: the
+    mean of their losses, and the fewest cells. Where one failed, the replicate did."""
+    shape = (len(found.losses), -1, task.conditions)
+    reasons: dict[tuple[int, int], str] = {}
+    for (row, k), words in sorted(found.reasons.items()):
+        replicate, condition = divmod(k, task.conditions)
+        reasons.setdefault((row, replicate), f"where {task.target.label(condition)}: {words}")
+    losses = found.losses.reshape(shape).mean(2)
+    for place in reasons:
+        losses[place] = task.target.failed
+    cells = found.cells.reshape(shape).min(2)
+    return replace(found, losses=losses, cells=cells, reasons=reasons, goals=None)
 
 
 def _below_failed(target: Target, score: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:
@@ -283,7 +301,8 @@ def finished_colonies(
     """The full-size colonies of one design at their ends, without those that fail."""
     try:
         scene = task.family.scene([values], repeat=len(streams))
-        prepared = colonies.prepare(scene, streams, task.settings)
+        each = [stream for stream in streams for _ in range(task.conditions)]
+        prepared = colonies.prepare(scene, each, task.settings)
     except tf.InputError:  # the scene refuses this design
         return []
     cells, until = task.end(1.0)

@@ -161,7 +161,9 @@ class Search(TaskOptions):
                 _show(bar, self.study)
                 finals = None
                 if self.finals is not None:
-                    run = (self.objective.task, self.study, colonies, executor, work_items)
+                    task = self.objective.task
+                    seeds = colonies / task.conditions
+                    run = (task, self.study, seeds, executor, work_items)
                     finals = FinalsRun(self.finals, *run)
                 holds = self._search(colonies, stop_at, finals, bar, executor, work_items)
                 if finals is not None and not holds and not all_failed(self.study):
@@ -188,12 +190,15 @@ class Search(TaskOptions):
         return bool(getattr(self._progress.chosen.method, "over", False))
 
     def _check_run(self, colonies: int, stop_at: float | None) -> None:
-        least = self.objective.task.replicates
-        hint = f"One design takes replicates={least} colonies." if least > 1 else ""
+        task = self.objective.task
+        least, count = task.colonies_each, task.conditions
+        under = f" under each of {count} conditions" if count > 1 else ""
+        takes = f"One design takes replicates={task.replicates} colonies{under}."
+        hint = takes if least > 1 else ""
         checks.integer("colonies", colonies, least=least, hint=hint)
         if stop_at is not None:
             checks.number("stop_at", stop_at)
-            if self.objective.task.goals:
+            if task.goals:
                 raise checks.input_error(
                     "stop_at", stop_at, "None with several goals", "A front has no one loss."
                 )
@@ -211,8 +216,7 @@ class Search(TaskOptions):
         the wanted loss."""
         assert self._progress.chosen is not None
         task, method = self.objective.task, self._progress.chosen.method
-        reserved = self.finals.colonies(colonies) if self.finals else 0.0
-        limit = max(colonies - reserved, task.replicates)  # one design at least
+        limit = max(colonies - self._reserved(colonies), task.colonies_each)  # one design at least
         seed = task.seed if self.method_seed is None else self.method_seed
         method.start(task.space, seed, task.replicates)
         proposal = repeat_study(method, task, self.study, self._known)
@@ -246,6 +250,11 @@ class Search(TaskOptions):
                 proposal = None
             _show(bar, self.study)
         return True
+
+    def _reserved(self, colonies: int) -> float:
+        """How many of the colonies are for the finals."""
+        count = self.objective.task.conditions
+        return count * self.finals.colonies(colonies / count) if self.finals else 0.0
 
     def _reached(self, stop_at: float | None, finals: FinalsRun | None) -> bool:
         """Whether the best design so far has the wanted loss, and holds it where it is tested."""
@@ -324,7 +333,7 @@ class Search(TaskOptions):
         before = Study.read(path).about.get("method", "") if path is not None and resumed else ""
         return choose(
             task.space.size,
-            colonies / task.replicates,
+            colonies / task.colonies_each,
             task.goals,
             task.target.pattern,
             self.objective.least_squares,
@@ -333,7 +342,7 @@ class Search(TaskOptions):
             before,
             # where choices are resolved, several designs are one
             math.inf if task.space.digest else designs_of(task.space),
-            (colonies - (self.finals.colonies(colonies) if self.finals else 0.0)) / task.replicates,
+            (colonies - self._reserved(colonies)) / task.colonies_each,
         )
 
     def _open_study(self, path: str | Path | None, method: str) -> Study:

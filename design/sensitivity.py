@@ -67,7 +67,9 @@ def loss_indices(
         [_estimate(rows[:, random.integers(samples, size=samples)]) for _ in range(RESAMPLES)]
     )
     first_error, total_error = drawn.std(0)
-    return Indices(first, total, first_error, total_error, samples, len(points) * task.replicates)
+    return Indices(
+        first, total, first_error, total_error, samples, len(points) * task.colonies_each
+    )
 
 
 def _estimate(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -93,7 +93,8 @@ class Task(TaskOptions):
         checks.device(self.device)
         until = _check_options(self)
         function, fixed = scene_function(self.scene), dict(self.fixed or {})
-        family = SceneFamily(function, Space(self.parameters), fixed, self.device)
+        space, conditions = Space(self.parameters), self.target.arguments
+        family = SceneFamily(function, space, fixed, self.device, conditions)
         if of_seeds(self.target) and self.replicates < 2:
             raise checks.input_error(
                 "replicates", self.replicates, "2 or more with Spread", "It compares seeds."
@@ -195,6 +196,16 @@ class Task(TaskOptions):
         """Whether the loss of a design is that of its worst colony."""
         by_target = self.target.reduced(np.zeros((1, self.replicates))) is not None
         return not by_target and self.reduce in ("worst", 1)
+
+    @property
+    def conditions(self) -> int:
+        """How many colonies make one replicate: one under each condition."""
+        return len(self.family.conditions)
+
+    @property
+    def colonies_each(self) -> int:
+        """How many colonies a design takes."""
+        return self.replicates * self.conditions
 
     @property
     def goals(self) -> int:

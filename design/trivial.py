@@ -37,6 +37,7 @@ def trivial_losses(
     (n,); by default their mean."""
     found: dict[str, list[float]] = {}
     even: list[np.ndarray] = []
+    ids: list[int] = []
     for part in finished:
         state, steps = part.state, 0 if part.history is None else part.history.shape[0]
         bright = BRIGHT * max(1.0, *(_greatest(state, n) for n in target.names), 0.0)
@@ -44,10 +45,16 @@ def trivial_losses(
         second = lambda count, level=bright: level * (torch.arange(count) % 2)
         for name, level in (("all dark", 0.0), ("all lit", bright), (EVERY_SECOND, second)):
             found.setdefault(name, []).extend(loss(level))
+        ids += [k // len(target.arguments) for k in state.colony_id.tolist()]
         even.append(np.array([loss(x) for x in np.geomspace(1e-6, 1.0, LEVELS) * bright]))
-    answers = {name: float(reduced(np.array([values]))[0]) for name, values in found.items()}
+    # under several conditions a replicate has the mean of its colonies
+    several = len(target.arguments) > 1
+    _, owner, counts = np.unique(ids, return_inverse=True, return_counts=True)
+    mean = lambda losses: np.bincount(owner, losses) / counts if several else losses
+    each = lambda rows: np.array([mean(row) for row in rows])
+    answers = {name: float(reduced(each([losses]))[0]) for name, losses in found.items()}
     if even:
-        answers["best even level"] = float(reduced(np.concatenate(even, 1)).min())
+        answers["best even level"] = float(reduced(each(np.concatenate(even, 1))).min())
     return answers
 
 

@@ -2,6 +2,7 @@
 
 from design.targets.base import Target
 from design.targets.composition import Composition
+from design.targets.conditions import Conditions
 from design.targets.goals import Burden, Constrained, Duration, Goals, Spread, Weighted
 from design.targets.gradient import Gradient
 from design.targets.image import Image
@@ -18,6 +19,7 @@ __all__ = [
     "Bands",
     "Burden",
     "Composition",
+    "Conditions",
     "Constrained",
     "DomainSize",
     "Duration",

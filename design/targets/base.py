@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -51,6 +52,24 @@ class Target(metaclass=checks.KnownKeywords):
     def times(self) -> tuple[float, ...]:
         """Times, h, at which it must see a colony after a step, beside the end."""
         return ()
+
+    @property
+    def arguments(self) -> tuple[Mapping[str, float], ...]:
+        """Under which arguments of the scene each replicate of a design is grown, one colony under
+        each; those of one have ids side by side."""
+        return ({},)
+
+    def label(self, place: int) -> str:
+        """One of the `arguments`, in words."""
+        return ""
+
+    def caption(self, colony_id: int) -> str:
+        """What a colony of a design is, in words."""
+        return f"replicate {colony_id}"
+
+    def concerns(self, measure: str, state: tf.State) -> Tensor:
+        """Which colonies a measure is of, (B,) bool."""
+        return torch.ones(state.colonies, dtype=torch.bool, device=state.device)
 
     def check(self, state: tf.State) -> None:
         """Raises `tf.InputError` where a first state lacks something that the target reads."""
@@ -154,6 +173,14 @@ class Target(metaclass=checks.KnownKeywords):
     def describe(self) -> str:
         """The pattern in one line."""
         return type(self).__name__
+
+
+def of_one_condition(name: str, part: Target) -> None:
+    """Raises `tf.InputError` for a part that is grown under several conditions."""
+    if len(part.arguments) > 1:
+        rule = "a target under one condition"
+        hint = "Conditions stand outermost, and take single targets."
+        raise checks.input_error(f"{name}: a target", part.describe(), rule, hint)
 
 
 def known(state: tf.State) -> list[str]:

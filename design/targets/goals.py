@@ -14,6 +14,7 @@ import torchfilm as tf
 from design.targets.base import (
     WORST,
     Target,
+    of_one_condition,
     ratio,
     require,
     species_names,
@@ -348,6 +349,7 @@ def of_seeds(target: Target) -> bool:
 
 def of_colonies(name: str, part: Target) -> None:
     """Raises `tf.InputError` for a part whose loss is none of single colonies."""
+    of_one_condition(name, part)
     if of_seeds(part):
         raise checks.input_error(
             f"{name}: a target",
@@ -376,6 +378,8 @@ class Goals(Several):
             raise checks.input_error(
                 "targets", self.parts, "two targets or more", "One goal has no front: give target=."
             )
+        for part in parts:
+            of_one_condition("targets", part)
         object.__setattr__(self, "parts", parts)
 
     @property

@@ -1,0 +1,134 @@
+"""One design under several conditions, such as amounts of an inducer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+import torchfilm as tf
+from design.targets.base import Target
+from design.targets.goals import of_colonies
+from design.targets.several import Several
+from torchfilm import checks
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+@dataclass(frozen=True)
+class Conditions(Several):
+    """A design that does something else under each of several conditions, such as a gate:
+
+        Conditions([({"iptg": 0.0}, dark), ({"iptg": 1.0}, lit)])
+
+    terms: pairs of arguments of the scene function, numbers by name, and the target under these.
+    Each replicate of a design is one colony under each condition, all with the same random numbers.
+    Its loss is the mean of theirs. A replicate fails where one of its colonies does. Measures bear
+    the name of their condition. Derivatives are differences between runs. It stands outermost:
+    other targets may be in it, and it in none.
+    """
+
+    terms: Sequence[tuple[Mapping[str, float], Target]]
+    parts: tuple[Target, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        terms = list(self.terms) if isinstance(self.terms, Sequence) else []
+        if len(terms) < 2 or not all(
+            isinstance(t, tuple | list) and len(t) == 2 and isinstance(t[1], Target) for t in terms
+        ):
+            rule = "pairs of arguments of the scene and a target, two at least"
+            hint = 'Such as Conditions([({"iptg": 0.0}, dark), ({"iptg": 1.0}, lit)]).'
+            raise checks.input_error("Conditions.terms", self.terms, rule, hint)
+        names = tuple(terms[0][0]) if isinstance(terms[0][0], Mapping) else ()
+        for k, (given, part) in enumerate(terms):
+            if not isinstance(given, Mapping) or not given or set(given) != set(names):
+                rule = "numbers by name, of the same names in each condition"
+                raise checks.input_error(f"Conditions.terms[{k}]", given, rule)
+            for name, value in given.items():
+                checks.number(f"Conditions.terms[{k}]: {name}", value)
+            of_colonies("Conditions", part)
+        found = [tuple(float(given[n]) for n in names) for given, _ in terms]
+        if len(set(found)) < len(found):
+            rule = "conditions that differ"
+            raise checks.input_error("Conditions.terms", [g for g, _ in terms], rule)
+        object.__setattr__(self, "terms", tuple((dict(given), part) for given, part in terms))
+        object.__setattr__(self, "parts", tuple(part for _, part in terms))
+
+    @property
+    def arguments(self) -> tuple[Mapping[str, float], ...]:
+        return tuple(given for given, _ in self.terms)
+
+    @property
+    def failed(self) -> float:  # type: ignore[override]
+        return max(part.failed for part in self.parts)
+
+    def label(self, place: int) -> str:
+        """A condition in words."""
+        return ", ".join(f"{name} = {value:g}" for name, value in self.arguments[place].items())
+
+    def caption(self, colony_id: int) -> str:
+        count = len(self.parts)
+        return f"{self.label(colony_id % count)}, replicate {colony_id // count}"
+
+    def _own(self, state: tf.State) -> Tensor:
+        """The condition of each colony, (B,): those of a replicate stand side by side."""
+        return state.colony_id % len(self.parts)
+
+    def why_rough(self, state: tf.State) -> str:
+        return "it has several conditions"
+
+    def unfit(self, state: tf.State) -> list[str]:
+        each = [part.unfit(state) for part in self.parts]
+        return [each[own][k] for k, own in enumerate(self._own(state).tolist())]
+
+    def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        return self.losses(state, history).gather(1, self._own(state).unsqueeze(1)).squeeze(1)
+
+    def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
+        each = self._each(lambda part, own: part.measures(state, own), state, history)
+        return {self._named(n, k): x for k, part in enumerate(each) for n, x in part.items()}
+
+    def concerns(self, measure: str, state: tf.State) -> Tensor:
+        return self._own(state) == self._of(measure)[1]
+
+    def _named(self, name: str, place: int) -> str:
+        return f"{name} ({self.label(place)})"
+
+    def _of(self, measure: str) -> tuple[str, int]:
+        """The name of a measure, and of which condition it is."""
+        for k in range(len(self.parts)):
+            end = self._named("", k)
+            if measure.endswith(end):
+                return measure.removesuffix(end), k
+        return measure, 0
+
+    @property
+    def bounds(self) -> dict[str, str]:
+        each = enumerate(part.bounds for part in self.parts)
+        return {self._named(n, k): b for k, bounds in each for n, b in bounds.items()}
+
+    @property
+    def evidence(self) -> dict[str, tuple[float, float]]:
+        each = enumerate(part.evidence for part in self.parts)
+        return {self._named(n, k): seen for k, found in each for n, seen in found.items()}
+
+    def why_undefined(self, measure: str) -> str:
+        name, place = self._of(measure)
+        return self.parts[place].why_undefined(name)
+
+    def reaches(self, state: tf.State) -> Tensor:
+        each = torch.stack([part.reaches(state) for part in self.parts], 1)
+        return each.gather(1, self._own(state).unsqueeze(1)).squeeze(1)
+
+    def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
+        each = self._each(lambda part, own: (part, own), state, history)
+        part, own = each[int(self._own(state)[place])]
+        part.draw(ax, state, place, own)
+
+    def describe(self) -> str:
+        each = enumerate(self.parts)
+        return "; ".join(f"{part.describe()} where {self.label(k)}" for k, part in each)
