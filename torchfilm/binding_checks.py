@@ -131,11 +131,12 @@ def _few(values: Tensor) -> str:
     return ", ".join(f"{x:g}" for x in each[:4]) + (", …" if len(each) > 4 else "")
 
 
-def check_births(effects: Sequence[BoundEffect]) -> None:
-    """Of a user's effect that looks for the divisions of the step: warn where cells divide later;
-    raise InputError where others may have removed cells since, so that rows are of other cells."""
-    for bound in (e for e in effects if is_own(e.effect)):
-        if not _calls(type(bound.effect), "births"):
+def warn_of_births(effects: Sequence[BoundEffect]) -> None:
+    """Of a user's effect that looks for the divisions of the step: warn where cells divide later,
+    and where others may have removed cells since, so that rows are of other cells."""
+    in_turn = sorted(effects, key=lambda e: e.stage)
+    for place, bound in enumerate(in_turn):
+        if not is_own(bound.effect) or not _reads(type(bound.effect), "births"):
             continue
         name = type(bound.effect).__name__
         divide = max((e.stage for e in effects if _divides(e)), default=bound.stage)
@@ -145,10 +146,10 @@ def check_births(effects: Sequence[BoundEffect]) -> None:
                 f" {divide:g}: it finds no divisions. Write stage = {divide + 5:g}, or another"
                 f" number above {divide:g}, in {name}."
             )
-        between = [e for e in effects if divide < e.stage < bound.stage and _removes(e)]
+        between = [e for e in in_turn[:place] if e.stage > divide and _removes(e)]
         if between:
-            first = min(between, key=lambda e: e.stage)
-            raise checks.InputError(
+            first = between[0]
+            warn(
                 f"{name} reads state.births at stage {bound.stage:g}, and {first.title} removes"
                 f" cells before it, at stage {first.stage:g}: the rows of state.births are those"
                 f" right after the divisions. Write stage = {(divide + first.stage) / 2:g}, or"
@@ -156,14 +157,15 @@ def check_births(effects: Sequence[BoundEffect]) -> None:
             )
 
 
-def _calls(kind: type, name: str) -> bool:
-    """Whether a method of a class reads an attribute of this name."""
-    methods = (getattr(x, "__code__", None) for x in vars(kind).values())
+def _reads(kind: type, name: str) -> bool:
+    """Whether a method of a class, its own or inherited from a user's, reads such an attribute."""
+    methods = (getattr(x, "__code__", None) for k in kind.__mro__ for x in vars(k).values()
+               if k not in (Effect, BoundEffect, object))  # fmt: skip
     return any(code is not None and name in code.co_names for code in methods)
 
 
 def _removes(effect: BoundEffect) -> bool:
-    return any(_calls(kind, "remove") for kind in (type(effect), type(effect.effect)))
+    return any(_reads(kind, "remove") for kind in (type(effect), type(effect.effect)))
 
 
 def _divides(effect: BoundEffect) -> bool:

@@ -367,7 +367,7 @@ def bind(
         effect.check(first)
     if check_first and only is None:
         binding_checks.warn_of_idle(model.effects, first)
-    binding_checks.check_births(model.effects)
+    binding_checks.warn_of_births(model.effects)
     return model
 
 

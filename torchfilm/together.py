@@ -9,6 +9,7 @@ fast, both follow. Anderson's mixing solves it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -36,9 +37,13 @@ from torchfilm.tools.timing import Timings
 PART, FINE, LOST = 0.3, 1e-3, 10.0
 FINEST_FINE = 1e-9  # roundings of float32 in species do not let a solve come much closer
 MOST = 50
-# Parts of a step into which a colony may divide it. ROUNDED: see `profile`.
+# Parts of a step into which a colony may divide it.
 FINEST = 16
-ROUNDED = 1e-6
+# In each half it is solved for concentrations so many times as small: where a signal has run out,
+# what cells take of it by a law that saturates at little depends on them. Less than a share of the
+# finest is nothing: it may be taken though it is not there.
+SHARPER, NOTHING = 1e-8, 1e-20
+ROUNDED = 1e-6  # see `profile`
 GREEDY = (
     "cells take more of a signal than there is. Let the rate at which they take it be 0 where the"
     " signal is, as D1·s.ahl or a saturating k·s.ahl/(K + s.ahl) are"
@@ -157,8 +162,7 @@ class Together:
             changed[OUTSIDE + name] = end.to(old.dtype)
             overdrawn = overdrawn + beyond.detach()
             wanted = wanted + total(released.detach().clamp(max=0.0).neg())
-            # a signal that has run out is solved for to `finest`, of which this may be a part, too
-            wanted = wanted + self.finest * total(step.transport[name].pool)
+            wanted = wanted + NOTHING * self.finest * total(step.transport[name].pool.detach())
             if f"{name}_reservoir" in state.fields:
                 away = total(torch.where(step.fed, 0.0, released))
                 changed[f"{name}_reservoir"] = state.fields[f"{name}_reservoir"] + away
@@ -183,6 +187,8 @@ class _Step:
     ):  # fmt: skip
         self.together, self.state, self.dt = together, state, dt
         self.done, self.number = done, number
+        halved = math.log2(number / together.medium.effect.steps)
+        self.finest = together.finest * SHARPER**halved
         self.found = medium.found
         self.first = {n: self.found[n].double() for n in together.names}
         outside, layout = medium.in_reservoir, state.layout
@@ -193,7 +199,7 @@ class _Step:
             n: JointTransport(
                 layout.grid, transport.with_uptake(n, state), medium.stencil,
                 medium.pool.double(), state.groups, state.fields[OUTSIDE + n], self.first[n],
-                self.fed, together.finest, dt,
+                self.fed, self.finest, dt,
             )
             for n in together.names
         }  # fmt: skip
@@ -295,7 +301,7 @@ def _by_torch(
     step: _Step, close: float, known: Outcome | None = None
 ) -> tuple[Outcome, FixedPoint]:
     """The outcome and the solution. known: the outcome of the first guess."""
-    start, groups, finest = step.start(), step.state.groups, step.together.finest
+    start, groups, finest = step.start(), step.state.groups, step.finest
     if step.state.cells and all(x.operators for x in step.transport.values()):
         # as `_by_kernels` mixes: a colony's bits must not depend on the circuits of others
         iteration, outcome = _Iteration(step, start.numpy(), close), known or step(start)
@@ -358,7 +364,7 @@ class _Iteration:
         numbers = self.x.numel()
         control = np.tile([0.0, np.inf, 1.0], (colonies, 1))
         self._earlier = np.zeros((4, numbers)), np.empty((DEPTH, 2, numbers)), control
-        self._scale = np.full(numbers, step.together.finest), np.ones(numbers, bool)
+        self._scale = np.full(numbers, step.finest), np.ones(numbers, bool)
         self.iterations = torch.zeros(colonies, dtype=torch.int64)
         self.going = torch.ones(colonies, dtype=torch.bool)
         self.far = torch.zeros(colonies, dtype=torch.bool)

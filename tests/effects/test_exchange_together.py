@@ -405,18 +405,38 @@ def eating_scene(unit: float, diffusion: float, cells=SIX, **circuit) -> tf.Scen
     return resting(medium(diffusion, decay=0.0, initial=unit), made, cells)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, F64], ids=str)
-@pytest.mark.parametrize("backend", [None, "torch"])
-def test_cells_may_eat_all_there_is(dtype, backend):
-    """Down to where numbers end: what is left then is less than the solve looks at."""
-    made = eating_scene(1.0, 1e5, backend=backend)
+@pytest.mark.parametrize(
+    ("dtype", "backend", "half", "most"),
+    [
+        (torch.float32, None, 0.05, 1e3), (torch.float32, "torch", 0.05, 1e3),
+        (F64, None, 1e-3, 1e4), (F64, "torch", 1e-3, 1e4), (F64, None, 1e-6, 1e4),
+    ],
+)  # fmt: skip
+def test_cells_may_eat_all_there_is(dtype, backend, half, most):
+    """Down to where numbers end, also by a law that saturates below what the solve looks at."""
+    made = eating_scene(1.0, 1e5, backend=backend, half=half, most=most)
     first = made.bind(dtype=dtype).start()
     whole = float(first.signals["ahl"].double().sum()) * first.layout.grid.voxel_volume
-    for state in tf.simulate(made, first, until=40 * DT, dt=DT):
+    for state in tf.simulate(made, first, until=60 * DT, dt=DT):
         assert float(state.signals["ahl"].min()) >= 0.0
     assert float(state.signals["ahl"].max()) < 1e-20
     eaten = float((state.eaten.double() * state.volume.double()).sum())
     assert eaten == pytest.approx(whole, rel=1e-5)
+
+
+@pytest.mark.parametrize("initial", [2e-6, 2e-12])
+def test_a_rate_that_does_not_fall_with_what_is_there_is_named(initial):
+    """However little there is: nothing is made of nothing."""
+
+    def takes(u, s, p, cell):
+        return {"eaten": p.rate + 0 * s.ahl}, {"ahl": -p.rate * cell.volume}
+
+    circuit = tf.Circuit(takes, species="eaten", rate=200 * initial, atol=1e-3 * initial)
+    made = resting(medium(1e5, decay=0.0, initial=initial), circuit, SIX)
+    with pytest.raises(tf.SimulationError, match="cells take more of a signal than there is"):
+        for state in tf.simulate(made, made.bind(dtype=F64).start(), until=400 * DT, dt=DT):
+            eaten = float((state.eaten * state.volume).sum())
+            assert eaten <= initial * 32.0**2 * 4.0 * 1.001
 
 
 def test_signals_in_too_large_a_unit_are_warned_of():

@@ -227,7 +227,8 @@ def test_alpha_follows_the_mean_overlap_and_the_few_that_are_far_above_it(worst,
 def test_three_cells_in_a_row_push_as_rigid_ones_do(contacts, dt):
     """Forces f₁ and f₂ keep both gaps closed: d ẋ = ±f with the drag d = μ(l + 2r) of each cell,
     and γ(l̇ − g(l + 4r/3)) = −(the mean of what presses its ends). Bilateral solves that stopped at
-    a worst residual of 0.05 lost 14 % of what the middle cell grows."""
+    a worst residual of 0.05 lost 14 % of what the middle cell grows; at 0.005 they lose some 2 %,
+    which is 0.8 % of its length."""
 
     def rates(t, y):
         drag, free = y[3:] + 1.0, y[3:] + 2 / 3

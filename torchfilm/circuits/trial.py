@@ -109,13 +109,14 @@ def _check_size(
         around = {name: part * value for name, value in circuit.signals.items()}
         fallen, _ = replace(circuit, signals=around).changes(concentrations, circuit.rows)
         size = max(size, largest(fallen.values()))
-    warn_if_small(circuit.label, "species", size, "Circuit.atol", atol)
+    _warn_if_small(circuit.label, "species", size, atol)
     for name, given in outside.items():
         # a signal that cells give, or make inside, may rise from nothing
-        given_by_none = name not in circuit.species and not bool((given.detach() > 0).any())
-        if name in circuit.signals and given_by_none:
+        given = given.detach()
+        taken = bool((given < 0).any()) and not bool((given > 0).any())
+        if taken and name in circuit.signals and name not in circuit.species:
             size = largest([circuit.signals[name]])
-            warn_if_small(circuit.label, f"signal {name!r}", size, "Circuit.atol", atol)
+            _warn_if_small(circuit.label, f"signal {name!r}", size, atol)
 
 
 def largest(found: Iterable[Tensor]) -> float:
@@ -128,12 +129,12 @@ def is_small(size: float, atol: float) -> bool:
     return 0 < SMALL * size < atol <= ATOL
 
 
-def warn_if_small(label: str, what: str, size: float, name: str, atol: float) -> None:
-    """Warn where errors of such concentrations count as nothing. name: of `atol`."""
+def _warn_if_small(label: str, what: str, size: float, atol: float) -> None:
+    """Warn where errors of such concentrations count as nothing."""
     if is_small(size, atol):
         warn(
-            f"{label}: its {what} {'are' if what.endswith('s') else 'is'} of about {size:.0e}, and"
-            f" errors below {name} = {atol:.0e} count as none. Give"
+            f"{label}: its {what} {'are' if what == 'species' else 'is'} of about {size:.0e}, and"
+            f" errors below Circuit.atol = {atol:.0e} count as none. Give"
             f" atol={1e-3 * SMALL * size:.0e}, or concentrations in a smaller unit, such as nM in"
             " place of M.",
             of=SMALL_SPECIES,

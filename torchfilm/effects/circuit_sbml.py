@@ -21,6 +21,8 @@ from torchfilm.values import ByType
 if TYPE_CHECKING:
     from torchfilm.effects.circuit import Circuit
 
+SHAPE = ("length", "radius")
+
 
 def read_file(path: str | Path) -> tuple[str, str]:
     """The text of an SBML file and what to call it in messages. Raises InputError for what is no
@@ -192,14 +194,18 @@ def _numbers_of_cell(names: Sequence[str], given: Mapping[str, float]) -> dict[s
     if not isinstance(given, Mapping):
         raise checks.input_error("cell", given, 'numbers by name, such as {"growth_rate": 1.0}')
     for name, value in given.items():
-        if name not in names:
-            raise checks.InputError(unknown(f"cell.{name} is not read by the rates", name, names))
+        if name in ("volume", "area"):
+            raise checks.input_error("cell", name, "left out: it follows from length and radius")
+        if name not in (*names, *SHAPE):
+            known = [*names, *SHAPE]
+            raise checks.InputError(unknown(f"cell.{name} is not read by the rates", name, known))
         checks.number(f"cell[{name!r}]", value)
-    found = {**sbml.usual_cell(), **given}
+    shape = {n: given[n] for n in SHAPE if n in given}
+    found = {**sbml.usual_cell(**shape), **given}
     if lacking := [n for n in names if n not in found]:
         give = ", ".join(f"{n!r}: …" for n in lacking)
         raise checks.InputError(
             f"the rates read {', '.join(f'cell.{n}' for n in lacking)}, and a model has one number"
             f" for each: give cell={{{give}}}."
         )
-    return {n: float(found[n]) for n in names}
+    return {n: float(found[n]) for n in (*names, "volume")}

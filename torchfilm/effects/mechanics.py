@@ -33,11 +33,11 @@ from torchfilm.tools.row_checks import check_variables
 from torchfilm.values import Rule, Value, checked, numbers, physical, quotient, smallest
 
 # The default length drag: free growth, but for bilateral contacts, which do not hold in it.
+LENGTH_DRAG = {"one-sided": 1e5, "bilateral": 10.0}
+CONTACTS = ("one-sided", "bilateral")
 # Accuracy settings state a worst residual; one-sided solves, whose tolerance is the error of
 # forces, are about as accurate at so many times that.
 OF_FORCES = 1.4
-LENGTH_DRAG = {"one-sided": 1e5, "bilateral": 10.0}
-CONTACTS = ("one-sided", "bilateral")
 OF_WALLS = {"stiffness": Rule("μ·µm/h", above=0.0), "weight": Rule(above=0.0, most=1.0)}
 OF_ADHESION = {"strength": Rule("μ·µm²/h", least=0.0)}
 

@@ -294,8 +294,8 @@ class Medium(Effect):
         )
         flat = shape[2] == 1 and self.depth is None and len(self.box[0]) == 2
         lines = [f"grid: {voxels} a colony" + (", as deep as a voxel is wide" if flat else "")]
-        sizes = [h for n, h in zip(shape, spacing, strict=True) if n > 1]
-        finest = min(sizes, default=spacing[0])
+        wide = [h * (n > 1) for n, h in zip(shape, spacing, strict=True)]
+        finest = min(filter(None, wide), default=spacing[0])
         strang = "half of transport before the cells, half after (Strang)"
         if len(coupled) < len(self.signals):
             lines.append(strang if self.halves else "cells, then transport (Lie)")
@@ -306,7 +306,7 @@ class Medium(Effect):
         lines += [f"{n}: moved together with {coupled[n]}, see there" for n in sorted(coupled)]
         for name, signal in self.signals.items():
             lines += reach_of(name, signal, finest)
-            lines += smear_of(name, signal, self.flow_of(name), spacing)
+            lines += smear_of(name, signal, self.flow_of(name), wide)
             if name in coupled:
                 continue
             whole = not self.halves or (name in exchanged and self.steps > 1)

@@ -18,7 +18,6 @@ from torchfilm.circuits.names import Names, UnknownName, label_of, unknown
 from torchfilm.circuits.network import build_network
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.circuits.tracing import Untraceable
-from torchfilm.circuits.trial import largest, warn_if_small
 from torchfilm.effect import FIRST_REACTIONS, LAST_REACTIONS, Binding, BoundEffect, Effect
 from torchfilm.resolver import snapshot
 from torchfilm.signals.schedule import warn_of_steps
@@ -214,8 +213,6 @@ class BoundReactions(BoundEffect):
             [state.fields[OUTSIDE + n].index_select(0, rows) for n in self.species], 1
         )
         changes, _ = self._voxels(state, None).changes(first, rows)
-        size = largest([first, *changes.values()])
-        warn_if_small(self.label, "signals", size, "MediumReactions.atol", self.effect.atol)
         return any(bool((rate != 0).any()) for rate in changes.values())
 
     def _some_voxels(self, state: State) -> Tensor:

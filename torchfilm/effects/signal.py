@@ -98,7 +98,11 @@ def smear_of(name: str, signal: Signal, flow: Any, spacing: Sequence[float]) -> 
         pairs = zip(*(x.tolist() for x in torch.broadcast_tensors(half, own)), strict=True)
         spread = lambda x, k: x / math.tanh(x / k) - k if k > 0 else x
         found += [(spread(x, k), k, x, axis) for x, k in pairs if x > 0]
-    more, k, half_most, axis = max(found)
+    if not found:
+        return []
+    more, k, half_most, axis = max(
+        found, key=lambda x: (x[0] / x[1] if x[1] > 0 else math.inf, x[0])
+    )
     if more <= SMEARED * k:
         return []
     times = f", {more / k:.2g} times its own" if k > 0 else ""

@@ -105,7 +105,7 @@ def sbml_text(
     _annotate(model, ids, undiluted, "cell.time" in leaves)
     _functions(model, roots)
     _units(model)
-    _compartments(model, ids, graph)
+    _compartments(model, ids, graph, cell["volume"])
     _species(model, ids, graph, initial)
     parameters = [(ids.of[f"p.{n}"], constants[n]) for n in graph.parameters]
     parameters += [(ids.of[f"cell.{n}"], cell[n]) for n in read_of_cell(graph)]
@@ -188,8 +188,8 @@ def _units(model: Element) -> None:
                                    "multiplier": str(factor)})  # fmt: skip
 
 
-def _compartments(model: Element, ids: Ids, graph: CircuitGraph) -> None:
-    sizes = {ids.of["cell.volume"]: usual_cell()["volume"]}
+def _compartments(model: Element, ids: Ids, graph: CircuitGraph, volume: float) -> None:
+    sizes = {ids.of["cell.volume"]: volume}
     if graph.signals:
         sizes[ids.add("medium", "medium")] = MEDIUM_SIZE
     _list(model, "compartment", (
