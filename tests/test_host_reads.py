@@ -108,12 +108,13 @@ def signalling() -> tf.Scene:
 # The bounds, reads a step, and what they are made of. A pass of one-sided contacts, of which most
 # steps have one, reads 17 times around two searches, and 50 times in ten rounds of Newton's method:
 # once a round, and once in two iterations of conjugate gradients (`tools.reads` tells why).
-# Bilateral ones read 10 times around a search, and 8 to 12 times in two rounds. A step of a
-# circuit's solver reads twice: 45 in 23 steps, and again in each of three or four iterations with
-# transport. One read more in each iteration, or in each step of a solver, would pass these bounds.
+# Bilateral ones read 10 times around a search, and some 25 times in two rounds, again once in two
+# iterations. A step of a circuit's solver reads twice: 45 in 23 steps, and again in each of three
+# or four iterations with transport. One read more in each iteration, or in each step of a solver,
+# would pass these bounds.
 SCENES = {
     "free growth": (lambda: tf.Scene(*colony("one-sided"), dt=0.025), 69),
-    "bilateral contacts": (lambda: tf.Scene(*colony("bilateral"), dt=0.025), 22),
+    "bilateral contacts": (lambda: tf.Scene(*colony("bilateral"), dt=0.025), 36),
     "a circuit with a signal": (signalling, 239),
 }
 
