@@ -249,13 +249,9 @@ class SavedDesign:
         or the parameters of the search, and they are not given."""
         parameters = self._part("parameters", self.given_parameters)
         target = self.target
-        every, names = self.content["parameters"], self._search["names"]
+        every, free = self.content["parameters"], (*self._search["names"], *self._under)
         options: dict[str, Any] = {
-            "fixed": {
-                name: value
-                for name, value in every.items()
-                if name not in names and name not in target.arguments[0]
-            },
+            "fixed": {name: value for name, value in every.items() if name not in free},
             **{name: self._search[name] for name in ("replicates", "reduce", "replay")},
             **{name: self.content.get(name) for name in ("cells", "until", "dt", "seed")},
         }

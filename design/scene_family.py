@@ -87,19 +87,12 @@ class SceneFamily:
         allowed = inspect.signature(self.function).parameters
         if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in allowed.values()):
             self.space.check(list(allowed), self.name)
-            for given in self.fixed:
-                if given not in allowed:
-                    raise checks.input_error(
-                        "fixed",
-                        given,
-                        f"a parameter of {self.name}: {', '.join(allowed)}",
-                        checks.suggestion(given, allowed),
-                    )
-            for given in self.conditions[0]:
-                if given not in allowed:
-                    rule = f"a parameter of {self.name}: {', '.join(allowed)}"
-                    hint = checks.suggestion(given, allowed)
-                    raise checks.input_error("Conditions", given, rule, hint)
+            for what, names in (("fixed", self.fixed), ("Conditions", self.conditions[0])):
+                for given in names:
+                    if given not in allowed:
+                        rule = f"a parameter of {self.name}: {', '.join(allowed)}"
+                        hint = checks.suggestion(given, allowed)
+                        raise checks.input_error(what, given, rule, hint)
         named = (*self.space.names, *self.fixed)
         if twice := [name for name in self.conditions[0] if name in named]:
             raise checks.input_error(
@@ -175,10 +168,8 @@ def try_scenes(
     made_of: dict[int, Any] = {}  # by the number of the trial
     endless, unfit, rough = [], [], []
     example: tf.Scene | None = None
-    stochastic, under = False, len(family.conditions)
-    attempt = lambda scene, count, cells: colonies.try_scene(
-        scene, count, seed=seed, dtype=dtype, device=family.device, replay=replay, cells=cells
-    )
+    stochastic = False
+    run: dict[str, Any] = {"seed": seed, "dtype": dtype, "replay": replay}
     for k, values in enumerate(trials):
         try:
             # two colonies: a tensor with one number would pass for a plain number
@@ -190,7 +181,7 @@ def try_scenes(
                     "cells of one colony",
                     "Each colony of a search starts from them: leave colony out.",
                 )
-            tried = attempt(scene, 2 * under, cells)
+            tried = _tried(family, scene, 2, cells, **run)
         except UnfitDesign as error:
             unfit.append(str(error))
             continue
@@ -206,7 +197,7 @@ def try_scenes(
     if example is None or all(endless):
         raise tf.InputError(unfit[0] if example is None else endless[0])
     scene = example
-    why_regrown = attempt(scene, under, None).why_regrown
+    why_regrown = _tried(family, scene, 1, None, **run).why_regrown
     # a function that calls a ready scene has parameters of its own, so it is not that scene
     ready = scene.recipe and family.function is tf.scenes.READY.get(scene.recipe[0])
     return TriedScenes(
@@ -220,6 +211,14 @@ def try_scenes(
         why_rough=next(filter(None, rough), ""),
         stochastic=stochastic,
     )
+
+
+def _tried(
+    family: SceneFamily, scene: tf.Scene, replicates: int, cells: int | None, **run: Any
+) -> colonies.TriedScene:
+    """What a trial of a scene for one design finds, with so many replicates."""
+    count = replicates * len(family.conditions)
+    return colonies.try_scene(scene, count, device=family.device, cells=cells, **run)
 
 
 def _idle(space: Space, made_of: Mapping[int, Any]) -> tuple[str, ...]:
@@ -271,15 +270,7 @@ def why_rough_together(family: SceneFamily, *, seed: int, dtype: torch.dtype, re
     for values in itertools.islice(_structures(family.space), MOST_TOGETHER):
         try:
             scene = family.scene([values], repeat=2)
-            tried = colonies.try_scene(
-                scene,
-                2 * len(family.conditions),
-                seed=seed,
-                dtype=dtype,
-                device=family.device,
-                replay=replay,
-                cells=None,
-            )
+            tried = _tried(family, scene, 2, None, seed=seed, dtype=dtype, replay=replay)
         except Exception:
             continue
         if why := why_rough(scene, tried.why_regrown):

@@ -162,8 +162,8 @@ class Search(TaskOptions):
                 finals = None
                 if self.finals is not None:
                     task = self.objective.task
-                    seeds = colonies / task.conditions
-                    run = (task, self.study, seeds, executor, work_items)
+                    under_each = colonies / task.conditions
+                    run = (task, self.study, under_each, executor, work_items)
                     finals = FinalsRun(self.finals, *run)
                 holds = self._search(colonies, stop_at, finals, bar, executor, work_items)
                 if finals is not None and not holds and not all_failed(self.study):

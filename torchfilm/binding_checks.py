@@ -133,9 +133,9 @@ def _few(values: Tensor) -> str:
 
 def warn_of_births(effects: Sequence[BoundEffect]) -> None:
     """Of a user's effect that looks for the divisions of the step: warn where cells divide later,
-    and where others may have removed cells since, so that rows are of other cells."""
-    in_turn = sorted(effects, key=lambda e: e.stage)
-    for place, bound in enumerate(in_turn):
+    and where others may have removed cells since, so that rows are of other cells. effects: in the
+    order of their stages."""
+    for place, bound in enumerate(effects):
         if not is_own(bound.effect) or not _reads(type(bound.effect), "births"):
             continue
         name = type(bound.effect).__name__
@@ -146,7 +146,7 @@ def warn_of_births(effects: Sequence[BoundEffect]) -> None:
                 f" {divide:g}: it finds no divisions. Write stage = {divide + 5:g}, or another"
                 f" number above {divide:g}, in {name}."
             )
-        between = [e for e in in_turn[:place] if e.stage > divide and _removes(e)]
+        between = [e for e in effects[:place] if e.stage > divide and _removes(e)]
         if between:
             first = between[0]
             warn(

@@ -65,7 +65,9 @@ class Target(metaclass=checks.KnownKeywords):
 
     def caption(self, colony_id: int) -> str:
         """What a colony of a design is, in words."""
-        return f"replicate {colony_id}"
+        replicate, place = divmod(colony_id, len(self.arguments))
+        under = self.label(place)
+        return f"{under}, replicate {replicate}" if under else f"replicate {replicate}"
 
     def concerns(self, measure: str, state: tf.State) -> Tensor:
         """Which colonies a measure is of, (B,) bool."""

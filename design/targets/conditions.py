@@ -70,10 +70,6 @@ class Conditions(Several):
         """A condition in words."""
         return ", ".join(f"{name} = {value:g}" for name, value in self.arguments[place].items())
 
-    def caption(self, colony_id: int) -> str:
-        count = len(self.parts)
-        return f"{self.label(colony_id % count)}, replicate {colony_id // count}"
-
     def _own(self, state: tf.State) -> Tensor:
         """The condition of each colony, (B,): those of a replicate stand side by side."""
         return state.colony_id % len(self.parts)

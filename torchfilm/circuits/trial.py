@@ -103,35 +103,35 @@ def _check_size(
 ) -> None:  # fmt: skip
     """Warn where species are so small, at first and by what an hour makes, that their errors count
     as nothing; or a signal at first that cells take."""
-    size = largest([concentrations, *inside.values()])
+    size = _largest([concentrations, *inside.values()])
     # a signal may repress at first, and less where cells have taken it up
-    for part in FALLEN if is_small(size, atol) and circuit.signals else ():
+    for part in FALLEN if _is_small(size, atol) and circuit.signals else ():
         around = {name: part * value for name, value in circuit.signals.items()}
         fallen, _ = replace(circuit, signals=around).changes(concentrations, circuit.rows)
-        size = max(size, largest(fallen.values()))
+        size = max(size, _largest(fallen.values()))
     _warn_if_small(circuit.label, "species", size, atol)
     for name, given in outside.items():
         # a signal that cells give, or make inside, may rise from nothing
         given = given.detach()
         taken = bool((given < 0).any()) and not bool((given > 0).any())
         if taken and name in circuit.signals and name not in circuit.species:
-            size = largest([circuit.signals[name]])
+            size = _largest([circuit.signals[name]])
             _warn_if_small(circuit.label, f"signal {name!r}", size, atol)
 
 
-def largest(found: Iterable[Tensor]) -> float:
+def _largest(found: Iterable[Tensor]) -> float:
     """The largest size of all numbers."""
     return max((float(x.detach().abs().max()) for x in found if x.numel()), default=0.0)
 
 
-def is_small(size: float, atol: float) -> bool:
+def _is_small(size: float, atol: float) -> bool:
     """Whether errors of concentrations of this size count as nothing, and nobody has wished so."""
     return 0 < SMALL * size < atol <= ATOL
 
 
 def _warn_if_small(label: str, what: str, size: float, atol: float) -> None:
     """Warn where errors of such concentrations count as nothing."""
-    if is_small(size, atol):
+    if _is_small(size, atol):
         warn(
             f"{label}: its {what} {'are' if what == 'species' else 'is'} of about {size:.0e}, and"
             f" errors below Circuit.atol = {atol:.0e} count as none. Give"

@@ -183,7 +183,7 @@ def write_file(
         circuit.name or label_of(part),
         *written_numbers(circuit, cell_type, initial, values),
         [n for n in circuit.species if n not in diluted],
-        _numbers_of_cell(sbml.read_of_cell(graph), cell),
+        _numbers_of_cell(sbml.read_of_cell(sbml.names_read(graph)), cell),
     )
     sbml.write(path, text)
 

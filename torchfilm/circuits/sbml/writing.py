@@ -87,7 +87,7 @@ def sbml_text(
     Raises InputError for names and equations that SBML cannot hold.
     """
     ids = Ids()
-    roots, leaves = _read(graph)
+    roots, leaves = [*graph.rates.values(), *graph.releases.values()], names_read(graph)
     ids.add("cell.volume", "cell")
     for name in graph.species:
         ids.add(f"u.{name}", name)
@@ -95,7 +95,8 @@ def sbml_text(
         ids.add(f"p.{name}", name)
     for name in graph.signals:
         ids.add(f"s.{name}", f"out_{name}")
-    for name in read_of_cell(graph):
+    of_cell = read_of_cell(leaves)
+    for name in of_cell:
         ids.add(f"cell.{name}", f"cell_{name}")
     top = Element("sbml", {"xmlns": CORE, "level": "3", "version": "2"})
     model = SubElement(top, "model", {
@@ -108,7 +109,7 @@ def sbml_text(
     _compartments(model, ids, graph, cell["volume"])
     _species(model, ids, graph, initial)
     parameters = [(ids.of[f"p.{n}"], constants[n]) for n in graph.parameters]
-    parameters += [(ids.of[f"cell.{n}"], cell[n]) for n in read_of_cell(graph)]
+    parameters += [(ids.of[f"cell.{n}"], cell[n]) for n in of_cell]
     _list(model, "parameter", ({"id": i, "value": _attribute(x), "constant": "true"}
                                for i, x in parameters))  # fmt: skip
     rules = _list(model, "rule", ())
@@ -122,15 +123,15 @@ def sbml_text(
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(top, "unicode") + "\n"
 
 
-def _read(graph: CircuitGraph) -> tuple[list[Expression], list[str]]:
-    """All rates, and the names that they read."""
+def names_read(graph: CircuitGraph) -> list[str]:
+    """The names that all rates read, such as "cell.length"."""
     roots = [*graph.rates.values(), *graph.releases.values()]
-    return roots, list(dict.fromkeys(e.name for e in walk(roots) if e.op == NAME))
+    return list(dict.fromkeys(e.name for e in walk(roots) if e.op == NAME))
 
 
-def read_of_cell(graph: CircuitGraph) -> list[str]:
-    """What the rates read of a cell, beside its volume and the time."""
-    names = [n.removeprefix("cell.") for n in _read(graph)[1] if n.startswith("cell.")]
+def read_of_cell(leaves: Iterable[str]) -> list[str]:
+    """What of the names that rates read is of a cell, beside its volume and the time."""
+    names = [n.removeprefix("cell.") for n in leaves if n.startswith("cell.")]
     return [n for n in names if n not in ("volume", "time")]
 
 
