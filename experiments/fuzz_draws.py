@@ -233,6 +233,8 @@ BOUNDARIES = {
     "periodic": tf.Periodic(),
     "open": tf.Open(0.5),
     "fixed": tf.Dirichlet(2.0),
+    "layer": tf.Robin(2.0, 30.0),
+    "fed": tf.Flux(5.0),
 }
 OUTSIDE = st.integers(2, 3).flatmap(
     lambda dim: st.builds(

@@ -33,9 +33,11 @@ from torchfilm.scene import Scene
 from torchfilm.signals.boundary_conditions import (
     BoundaryConditions,
     Dirichlet,
+    Flux,
     NoFlux,
     Open,
     Periodic,
+    Robin,
 )
 from torchfilm.signals.schedule import Schedule
 from torchfilm.simulation import rollout, simulate
@@ -90,6 +92,7 @@ __all__ = [
     "Effect",
     "Erosion",
     "Field",
+    "Flux",
     "Groups",
     "Growth",
     "GrowthRecording",
@@ -114,6 +117,7 @@ __all__ = [
     "Removal",
     "Replay",
     "Results",
+    "Robin",
     "Rules",
     "Scene",
     "Schedule",

@@ -355,7 +355,7 @@ def test_each_colony_has_its_own_numbers(device, dtype):
                     x=(Dirichlet(torch.tensor([1.0, 2.0, 3.0])), NoFlux())
                 )
             },
-            "beyond a face along x",
+            "at a face along x",
         ),
         ({"shape": (4, 4)}, "shape"),
         ({"shape": (4, 0, 4)}, "shape"),

@@ -17,13 +17,17 @@ from torchfilm.signals.boundary_conditions import (
     NoFlux,
     Open,
     Periodic,
+    Robin,
 )
 from torchfilm.signals.transport import METHODS, prepare
 from torchfilm.signals.transport_rates import build_operator
 from torchfilm.signals.transport_series import ABOVE
 
 face = st.one_of(
-    st.just(NoFlux()), st.builds(Dirichlet, st.floats(0, 1)), st.builds(Open, st.floats(0, 1))
+    st.just(NoFlux()),
+    st.builds(Dirichlet, st.floats(0, 1)),
+    st.builds(Open, st.floats(0, 1)),
+    st.builds(Robin, st.floats(0, 1), st.floats(1e-3, 1e6)),
 )
 pair = st.one_of(st.just(Periodic()), st.tuples(face, face))
 closed = st.sampled_from([NoFlux(), Periodic()])

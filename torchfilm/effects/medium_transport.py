@@ -72,7 +72,7 @@ class Constants:
     def numbers(self, name: str) -> list[Any]:
         """The values that a signal's transport depends on; some are tensors."""
         signal, flow = self.signals[name], self.flows[name]
-        faces = [face.outside_value() for pair in self.boundary[name].pairs for face in pair]
+        faces = [x for pair in self.boundary[name].pairs for face in pair for x in face.numbers()]
         moving = [] if callable(flow) else list(flow or ())
         return [signal.diffusion, signal.decay, signal.source, *faces, *moving]
 

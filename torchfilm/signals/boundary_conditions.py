@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from torchfilm.signals.schedule import Schedule, checked_values
@@ -19,9 +20,13 @@ class Face(metaclass=checks.KnownKeywords):
     """The base of all faces."""
 
     def outside_value(self) -> float | Tensor | Schedule:
-        """The concentration beyond the face, one number or one per colony, or a schedule of them; 0
-        where none enters."""
+        """The concentration beyond the face, or the given flux, one number or one per colony, or a
+        schedule of them; 0 where none enters."""
         return 0.0
+
+    def numbers(self) -> list[Any]:
+        """The values that the exchange through the face depends on."""
+        return [self.outside_value()]
 
     def take(self, colonies: Tensor) -> Face:
         """The face of these colonies of the batch, (b,) int64."""
@@ -50,6 +55,60 @@ class Dirichlet(Face):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "value", _checked("Dirichlet.value", self.value))
+
+    def outside_value(self) -> float | Tensor | Schedule:
+        return self.value
+
+    def take(self, colonies: Tensor) -> Face:
+        return replace(self, value=_take(self.value, colonies))
+
+
+@dataclass(frozen=True)
+class Robin(Face):
+    """Through the face enters `transfer` · (`value` − concentration at the face): a boundary layer
+    of still medium, a membrane, or a film beyond which the concentration is `value`.
+
+    value: ≥ 0, one number or one per colony, or a `Schedule` of them. transfer: the mass-transfer
+    coefficient or permeability, > 0, µm/h, one number or one per colony; K/L for a layer of
+    thickness L µm. A flow passes the layer too.
+    """
+
+    value: float | Tensor | Schedule
+    transfer: float | Tensor
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "value", _checked("Robin.value", self.value))
+        made = checks.value("Robin.transfer", self.transfer, least=0.0)
+        if not bool((torch.as_tensor(made) > 0).all()):
+            raise checks.input_error(
+                "Robin.transfer", self.transfer, "above 0, µm/h", "NoFlux() lets nothing pass."
+            )
+        object.__setattr__(self, "transfer", made)
+
+    def outside_value(self) -> float | Tensor | Schedule:
+        return self.value
+
+    def numbers(self) -> list[Any]:
+        return [self.value, self.transfer]
+
+    def take(self, colonies: Tensor) -> Face:
+        return replace(
+            self, value=_take(self.value, colonies), transfer=_take(self.transfer, colonies)
+        )
+
+
+@dataclass(frozen=True)
+class Flux(Face):
+    """`value` enters through the face, by diffusion and flow together, per area and hour,
+    concentration · µm/h, wherever no obstacle closes it.
+
+    value: ≥ 0, one number or one per colony, or a `Schedule` of them.
+    """
+
+    value: float | Tensor | Schedule
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "value", _checked("Flux.value", self.value))
 
     def outside_value(self) -> float | Tensor | Schedule:
         return self.value
@@ -104,7 +163,8 @@ class BoundaryConditions(metaclass=checks.KnownKeywords):
                     f"BoundaryConditions.{axis}",
                     given,
                     "a face or a pair of faces (low, high)",
-                    "Faces are NoFlux(), Periodic(), Dirichlet(value) and Open(outside).",
+                    "Faces are NoFlux(), Periodic(), Dirichlet(value), Robin(value, transfer),"
+                    " Flux(value) and Open(outside).",
                 )
             if isinstance(pair[0], Periodic) != isinstance(pair[1], Periodic):
                 raise checks.input_error(

@@ -16,9 +16,11 @@ from torchfilm.signals.boundary_conditions import (
     BoundaryConditions,
     Dirichlet,
     Face,
+    Flux,
     NoFlux,
     Open,
     Periodic,
+    Robin,
 )
 from torchfilm.signals.grid import Shape
 from torchfilm.signals.schedule import Schedule
@@ -108,7 +110,10 @@ def _exchange(
             "the same at the low and the high face",
         )
     interior = fitted_rates(diffusion, flow)
-    ends = [_face_rates(face, diffusion, at) for face, at in zip(pair, (low, high), strict=True)]
+    ends = [
+        _face_rates(face, diffusion, at, given, given.spacing[axis], inwards)
+        for face, at, inwards in zip(pair, (low, high), (0, 1), strict=True)
+    ]
     parts = []
     for k in range(2):
         middle = (
@@ -116,8 +121,10 @@ def _exchange(
             if uniform
             else interior[k].narrow(dim, 1, n - 1)
         )
-        parts.append(torch.cat([ends[0][k], middle, ends[1][k]], dim))
-    name = f"value beyond a face along {AXES[axis]}"
+        rows = torch.broadcast_shapes(*(x.shape[:1] for x in (ends[0][k], middle, ends[1][k])))
+        whole = [x.expand(*rows, *x.shape[1:]) for x in (ends[0][k], middle, ends[1][k])]
+        parts.append(torch.cat(whole, dim))
+    name = f"value at a face along {AXES[axis]}"
     outside = [
         given.number(name, face.outside_value()) if _has_inflow(face) else None for face in pair
     ]
@@ -134,16 +141,25 @@ def _has_inflow(face: Face) -> bool:
     return isinstance(outside, Tensor) or outside > 0
 
 
-def _face_rates(face: Face, diffusion: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
-    """(up, down) at a face of the box."""
+def _face_rates(
+    face: Face, diffusion: Tensor, flow: Tensor, given: _OperatorInput, h: float, inwards: int
+) -> tuple[Tensor, Tensor]:
+    """(up, down) at a face of the box, 1/h. inwards: which of them leads into it."""
     if isinstance(face, Periodic):
         return fitted_rates(diffusion, flow)
     if isinstance(face, Dirichlet):
         return fitted_rates(2 * diffusion, flow)  # the face is half a voxel away
+    if isinstance(face, Robin):
+        # half a voxel and what is beyond the face, one after the other; the flow passes both
+        half, beyond = 2 * diffusion, given.number("Robin.transfer", face.transfer) / h
+        return fitted_rates(half * beyond / (half + beyond), flow)
     if isinstance(face, Open):
         return fitted_rates(torch.zeros_like(diffusion), flow)
-    assert isinstance(face, NoFlux)
     nothing = torch.zeros_like(diffusion + flow)
+    if isinstance(face, Flux):
+        enters = nothing + 1 / h  # times the flux, as that of other faces times a concentration
+        return (nothing, enters) if inwards else (enters, nothing)
+    assert isinstance(face, NoFlux)
     return nothing, nothing
 
 
