@@ -27,9 +27,9 @@ class Exchange:
 
     up, down: (B or 1, …), with n + 1 along the axis, and one or the number of voxels along the
     others. up[i] is the rate, 1/h, at which voxel i − 1 gives to voxel i; down[i] is the reverse
-    rate. low, high: (B or 1, 1, 1, 1), the concentration beyond the box, or None where none enters; at a
-    face with a given flux, that, and its rate is 1 over the width of a voxel, 1/µm.
-    On a periodic axis the first face and the last are the same.
+    rate. low, high: (B or 1, 1, 1, 1), the concentration beyond the box, or None where none enters.
+    Where a flux is given, they are that flux, at a rate of 1 over the width of a voxel, 1/µm. On a
+    periodic axis the first face and the last are the same.
     """
 
     axis: int
