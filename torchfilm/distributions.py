@@ -17,8 +17,8 @@ from torchfilm.values import COLONY, Distribution, Rule, largest, numbers, small
 class Uniform(Distribution):
     """Uniform between low and high; each one number or one per colony."""
 
-    low: float | Tensor
-    high: float | Tensor
+    low: checks.Value
+    high: checks.Value
 
     parameters = ("low", "high")
 
@@ -45,8 +45,8 @@ class Normal(Distribution):
     """Gaussian of mean and sd; each one number or one per colony. Its tails beyond 4 sd (one draw
     in 16,000) are folded back inside."""
 
-    mean: float | Tensor
-    sd: float | Tensor
+    mean: checks.Value
+    sd: checks.Value
 
     parameters = ("mean", "sd")
     reach = "A Normal reaches from mean − 4 sd to mean + 4 sd: give a smaller sd, or a LogNormal."
@@ -70,8 +70,8 @@ class LogNormal(Distribution):
     """The exponential of a Gaussian: its median, and sigma, the standard deviation of its
     logarithm; each one number or one per colony."""
 
-    median: float | Tensor
-    sigma: float | Tensor
+    median: checks.Value
+    sigma: checks.Value
 
     parameters = ("median", "sigma")
 

@@ -67,7 +67,7 @@ def on_grid(
     return value if layout.mask is None else value * layout.mask
 
 
-def _of_colonies(given: float | Tensor, state: State) -> Tensor:
+def _of_colonies(given: checks.Value, state: State) -> Tensor:
     """A value as a (B,) or 0-dim tensor of the state's dtype; one value per colony is taken by
     colony id."""
     if not isinstance(given, Tensor):

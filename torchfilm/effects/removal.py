@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from torchfilm.effect import REMOVAL, Effect
 from torchfilm.resolver import Values
@@ -32,8 +31,8 @@ class Removal(Effect):
     does a corner that is left out.
     """
 
-    low: Sequence[float | Tensor] = ()
-    high: Sequence[float | Tensor] = ()
+    low: Sequence[checks.Value] = ()
+    high: Sequence[checks.Value] = ()
 
     stage = REMOVAL
     title = "removal"

@@ -19,10 +19,10 @@ from torchfilm.tools import checks
 from torchfilm.values import Distribution, PerColony, Rule, checked
 
 # A value on the grid: a number, one per colony, or a function from positions (M, 3) µm to (M,).
-OnGrid = float | Tensor | Callable[[Tensor], Tensor]
+OnGrid = checks.Value | Callable[[Tensor], Tensor]
 # A velocity: two or three numbers (or one per colony each), or a function from positions (M, 3) µm
 # to velocities (M, 3).
-Flow = Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
+Flow = Sequence[checks.Value] | Callable[[Tensor], Tensor] | None
 
 
 SMEARED = 0.1  # of its own diffusion, that voxels add where it flows
@@ -43,13 +43,13 @@ class Signal(metaclass=checks.KnownKeywords):
     source, flow and reservoir, and what the faces are given, may be a `Schedule`.
     """
 
-    diffusion: float | Tensor
+    diffusion: checks.Value
     decay: OnGrid = 0.0
     initial: OnGrid | Distribution = 0.0
     source: OnGrid | Schedule = 0.0
     boundary: BoundaryConditions | None = None
     flow: Flow | Schedule = None
-    reservoir: float | Tensor | Schedule = 0.0
+    reservoir: checks.Value | Schedule = 0.0
 
     instead: ClassVar[Mapping[str, str]] = {
         "D": "Did you mean diffusion?",

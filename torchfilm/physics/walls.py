@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchfilm.physics.surfaces import FlatSurface, RoundSurface, Surface, Vector
 from torchfilm.tools import checks
+from torchfilm.tools.one_per_colony import Kept
 
 AXES = "xyz"
 
@@ -112,9 +113,9 @@ class Plane(Wall):
 
     turn_hint = "Is the wall inside out? Turn it (facing or normal), or move the cell."
 
-    x: float | Tensor | None = field(default=None, kw_only=True)
-    y: float | Tensor | None = field(default=None, kw_only=True)
-    z: float | Tensor | None = field(default=None, kw_only=True)
+    x: checks.Value | None = field(default=None, kw_only=True)
+    y: checks.Value | None = field(default=None, kw_only=True)
+    z: checks.Value | None = field(default=None, kw_only=True)
     facing: str | None = field(default=None, kw_only=True)
     point: Sequence[float | Tensor] | Tensor | None = field(default=None, kw_only=True)
     normal: Sequence[float | Tensor] | Tensor | None = field(default=None, kw_only=True)
@@ -194,7 +195,7 @@ class Sphere(Wall):
     turn_hint = "Is the wall inside out? Change `inside`, or move the cell."
 
     center: Sequence[float | Tensor] | Tensor
-    radius: float | Tensor
+    radius: checks.Value
     inside: bool = True
 
     def __post_init__(self) -> None:
@@ -207,7 +208,8 @@ class Sphere(Wall):
             raise checks.input_error(
                 "Sphere.center", tuple(self.center), f"of {dim} numbers in a {dim}-D scene"
             )
-        return [RoundSurface(self, tuple(self.center), self.radius, self.inside)]
+        radius = cast("Kept", self.radius)
+        return [RoundSurface(self, tuple(self.center), radius, self.inside)]
 
 
 @dataclass(frozen=True)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from torchfilm.signals.schedule import Schedule, checked_values
 from torchfilm.tools import checks
+from torchfilm.tools.one_per_colony import Kept
 
 AXES = "xyz"
 
@@ -19,7 +20,7 @@ AXES = "xyz"
 class Face(metaclass=checks.KnownKeywords):
     """The base of all faces."""
 
-    def outside_value(self) -> float | Tensor | Schedule:
+    def outside_value(self) -> Kept | Schedule:
         """The concentration beyond the face, or the given flux, one number or one per colony, or a
         schedule of them; 0 where none enters."""
         return 0.0
@@ -51,13 +52,13 @@ class Dirichlet(Face):
     The face is half a voxel from the nearest centre.
     """
 
-    value: float | Tensor | Schedule
+    value: checks.Value | Schedule
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "value", _checked("Dirichlet.value", self.value))
 
-    def outside_value(self) -> float | Tensor | Schedule:
-        return self.value
+    def outside_value(self) -> Kept | Schedule:
+        return cast("Kept | Schedule", self.value)
 
     def take(self, colonies: Tensor) -> Face:
         return replace(self, value=_take(self.value, colonies))
@@ -73,8 +74,8 @@ class Robin(Face):
     thickness L µm. A flow passes the layer too.
     """
 
-    value: float | Tensor | Schedule
-    transfer: float | Tensor
+    value: checks.Value | Schedule
+    transfer: checks.Value
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "value", _checked("Robin.value", self.value))
@@ -85,8 +86,8 @@ class Robin(Face):
             )
         object.__setattr__(self, "transfer", made)
 
-    def outside_value(self) -> float | Tensor | Schedule:
-        return self.value
+    def outside_value(self) -> Kept | Schedule:
+        return cast("Kept | Schedule", self.value)
 
     def numbers(self) -> list[Any]:
         return [self.value, self.transfer]
@@ -105,13 +106,13 @@ class Flux(Face):
     value: ≥ 0, one number or one per colony, or a `Schedule` of them.
     """
 
-    value: float | Tensor | Schedule
+    value: checks.Value | Schedule
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "value", _checked("Flux.value", self.value))
 
-    def outside_value(self) -> float | Tensor | Schedule:
-        return self.value
+    def outside_value(self) -> Kept | Schedule:
+        return cast("Kept | Schedule", self.value)
 
     def take(self, colonies: Tensor) -> Face:
         return replace(self, value=_take(self.value, colonies))
@@ -124,13 +125,13 @@ class Open(Face):
     outside: ≥ 0, one number or one per colony, or a `Schedule` of them.
     """
 
-    outside: float | Tensor | Schedule = 0.0
+    outside: checks.Value | Schedule = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "outside", _checked("Open.outside", self.outside))
 
-    def outside_value(self) -> float | Tensor | Schedule:
-        return self.outside
+    def outside_value(self) -> Kept | Schedule:
+        return cast("Kept | Schedule", self.outside)
 
     def take(self, colonies: Tensor) -> Face:
         return replace(self, outside=_take(self.outside, colonies))

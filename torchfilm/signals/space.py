@@ -161,7 +161,7 @@ def check_used(medium: Any) -> None:
                 " Medium(outside='reservoir')."
             )
         faces = [face for pair in medium.boundary_of(name).pairs for face in pair]
-        carried = any(isinstance(face, Open) and _given(face.outside) for face in faces)
+        carried = any(isinstance(face, Open) and _given(face.outside_value()) for face in faces)
         if carried and medium.flow_of(name) is None:
             warn(
                 f"Open(outside=…) of the signal {name!r} does nothing, since no flow carries it in."

@@ -16,13 +16,13 @@ from typing import Any, TypeVar, cast
 import torch
 from torch import Tensor
 
+from torchfilm.tools.one_per_colony import Value as Value
 from torchfilm.tools.warn_once import SMALL_SPECIES as SMALL_SPECIES  # public, for searches
 from torchfilm.tools.warn_once import once as once
 from torchfilm.tools.whole_files import write_whole as write_whole
 
 Number = float | int
 F = TypeVar("F", bound=Callable[..., Any])
-Value = float | Tensor | Sequence[float]
 ONE_OR_EACH = "Give one number, or one per colony."
 
 
