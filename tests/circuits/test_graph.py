@@ -135,6 +135,7 @@ def test_the_jacobian_by_species_and_by_parameters():
     assert by[("s", "k1")] == pytest.approx(-0.21) and by[("pr", "k3")] == 0.2
     assert ("pr", "k1") not in by and not any(n == "unused" for _, n in by)
     assert float(graph.evaluate(values)["pr"]) == pytest.approx(0.6)
+    assert "('pr', 'es'): k3" in str(graph.jacobian())
     with pytest.raises(tf.InputError, match="by"):
         graph.jacobian(by="time")
     with pytest.raises(tf.InputError, match="values lack 'es'"):

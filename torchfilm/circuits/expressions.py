@@ -12,7 +12,7 @@ LOGICAL = (*COMPARISONS, "and", "or", "not")
 QUIET = ("cast32", "cast64", "full32", "full64", "detach")  # operations on the type of a number
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
 class Expression:
     """A node: an operation on others, a number, or a name such as "u.ahl", "p.k1"."""
 
@@ -21,7 +21,7 @@ class Expression:
     value: float = 0.0
     name: str = ""
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         from torchfilm.circuits.formulas import text  # which writes expressions
 
         return text(self)

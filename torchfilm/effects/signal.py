@@ -135,6 +135,12 @@ def _on_grid(name: str, given: Any) -> OnGrid:
 
 def velocity(name: str, given: Any) -> Any:
     """A checked velocity, or a schedule of them."""
+    if isinstance(given, (tuple, list)):
+        for k, part in enumerate(given):
+            if isinstance(part, Schedule):
+                hint = "Such as flow=tf.Schedule({0: (0.0, 0.0), 2: (40.0, 0.0)})."
+                rule = "a number: a schedule is one of whole velocities"
+                raise checks.input_error(f"{name}[{k}]", part, rule, hint)
     return checked_values(name, given, lambda name, flow: checked_flow(name, _bare(flow)))
 
 
