@@ -16,7 +16,9 @@ from design.posterior import Posterior
 from design.prior import Prior
 from design.progress import advance, open_bar
 from design.simulations import Simulations, simulate_designs
+from design.targets.conditions import Conditions
 from design.targets.observed import Observed
+from design.targets.observed_conditions import one_observed
 from design.task import Task
 from torchfilm import checks
 
@@ -27,7 +29,7 @@ LEAST = 50  # simulations that succeeded
 def infer(
     scene: Callable[..., tf.Scene] | str,
     parameters: Sequence[Parameter | Choice],
-    observed: Observed,
+    observed: Observed | Conditions,
     *,
     simulations: int = 5000,
     cells: int | None = None,
@@ -56,6 +58,8 @@ def infer(
     observed, whose statistics are averaged. From these, neural posterior estimation
     (`NeuralPosterior` names the sources) learns the density of the parameters, given statistics.
     Simulations that fail are left out, so the posterior is that of colonies that do not.
+    observed: the data, or `Conditions` of the data of each condition, such as a dose response: each
+    replicate is then a colony under each condition, with random numbers of its own.
 
     scene, parameters, cells, fixed, seed, dt, dtype, device: as for `Search`. until: h, by default
     when the data were observed. replicates: with fewer than were observed, the posterior is wider
@@ -68,37 +72,39 @@ def infer(
     extra), for the file of other simulations, and where fewer than 50 simulations succeed.
     """
     require_sbi()
-    _check_observed(observed)
+    data = _checked_data(observed)
     for name, value, least in (
         ("simulations", simulations, LEAST), ("samples", samples, 10), ("flows", flows, 1),
         ("epochs", epochs, 1),
     ):  # fmt: skip
         checks.integer(name, value, least=least)
-    _check_end(observed.time, cells, until)
+    _check_end(data.time, cells, until)
     kept = None if path is None else checks.file_path("path", path)
     task = Task(
-        scene, parameters, observed, cells=cells,
-        until=observed.time if until is None and cells is None else until,
-        replicates=observed.colonies if replicates is None else replicates,
+        scene, parameters, data.grown, cells=cells,
+        until=data.time if until is None and cells is None else until,
+        replicates=data.colonies if replicates is None else replicates,
         fixed=fixed, seed=seed, dt=dt, dtype=dtype, device=device, replay=False,
     )  # fmt: skip
     known = Prior(task.space, prior)
     found = _simulate(task, known, simulations, kept, executor, progress)
     with open_bar(flows, progress, "infer", counted="flows") as bar:
         estimator = _learn(found, seed, flows, epochs, bar)
-    return Posterior.of(task, known, found, estimator, observed, samples)
+    return Posterior.of(task, known, found, estimator, data, samples)
 
 
-def _check_observed(observed: Any) -> None:
-    """Raise InputError for what is no data."""
+def _checked_data(observed: Any) -> Observed:
+    """The data, those of several conditions as one. Raises InputError for what is no data."""
     if isinstance(observed, (list, tuple)):
         raise tf.InputError(
             "observed is one Observed, not a list: put data of several times together as"
             " ObservedCourse([…])."
         )
-    if not isinstance(observed, Observed):
-        rule = "an Observed, such as Observed.from_table(…)"
+    data = one_observed(observed)
+    if not isinstance(data, Observed):
+        rule = "an Observed, such as Observed.from_table(…), or Conditions of them"
         raise checks.input_error("observed", observed, rule)
+    return data
 
 
 def _check_end(seen: float | None, cells: int | None, until: float | None) -> None:

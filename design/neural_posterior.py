@@ -160,7 +160,7 @@ def _learn_flows(
     for attempt in range(AGAIN + 1):
         poor = max(line, *(fit for fit, _ in found)) - POOR
         for k in range(flows):
-            if found[k][0] >= poor:
+            if found[k][1] is not None and found[k][0] >= poor:
                 continue
             begun(k)
             made = _learn_flow(theta, x, seed + attempt * flows + k, epochs)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -15,7 +16,9 @@ from design.posterior_plot import draw_corner
 from design.prediction import Prediction
 from design.prior import Prior
 from design.simulations import Simulations, random_points, shown_values, simulate_points
+from design.targets.conditions import Conditions
 from design.targets.observed import Observed
+from design.targets.observed_conditions import one_observed
 from design.task import Task
 from torchfilm import checks
 
@@ -58,27 +61,28 @@ class Posterior:
         points = estimator.sample(row, samples, seed=task.seed)[0]
         return Posterior(task, prior, simulations, estimator, observed, points)
 
-    def given(self, observed: Observed) -> Posterior:
+    def given(self, observed: Observed | Conditions) -> Posterior:
         """The posterior for other data of the same statistics (`Observed.from_table(…, like=…)`)
         and as many colonies, without further simulations."""
-        if observed.plan != self.observed.plan or observed.colonies != self.observed.colonies:
+        data = cast(Observed, one_observed(observed))
+        if data.plan != self.observed.plan or data.colonies != self.observed.colonies:
             raise checks.input_error(
                 "observed",
-                observed.describe(),
+                data.describe(),
                 f"data of the same statistics from {self.observed.colonies} colonies",
                 "Make it with like=….",
             )
         when = self.observed.time if self.task.until is None else self.task.until
-        now = observed.time
+        now = data.time
         if when is not None and now is not None and abs(now - when) > 1e-6 * when:
             raise checks.input_error(
                 "observed",
-                observed.describe(),
+                data.describe(),
                 f"data of {when:g} h, since the posterior was learnt from colonies of that age",
                 "Call infer(…) for data of another time.",
             )
         known = self.task, self.prior, self.simulations, self.estimator
-        return self.of(*known, observed, len(self.points))
+        return self.of(*known, data, len(self.points))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -25,6 +25,7 @@ from design.parameters import Value
 from design.prior import Prior
 from design.scoring import WorkItem, cut_work_items
 from design.targets.observed import Observed
+from design.targets.observed_conditions import one_observed
 from design.task import Task
 from torchfilm import checks
 
@@ -74,8 +75,9 @@ class Simulations:
 
 def observed_of(task: Task) -> Observed:
     """The data of a task of inference."""
-    assert isinstance(task.target, Observed)
-    return task.target
+    observed = one_observed(task.target)
+    assert isinstance(observed, Observed)
+    return observed
 
 
 def about(task: Task, prior: Prior) -> dict[str, Any]:
@@ -97,7 +99,7 @@ def simulate_designs(
     seen: Callable[[int], None] = lambda count: None,
 ) -> Simulations:
     """Simulate `count` designs with parameters drawn from the prior (by default evenly), each with
-    `task.replicates` colonies and random numbers of its own.
+    `task.replicates` colonies, under each condition, and random numbers of its own.
 
     path: of the file that keeps them; those that it holds are not simulated again. executor: of the
     `concurrent.futures` kind. seen: called with the number of designs that are known. Simulation
@@ -158,9 +160,9 @@ def _run_item(task: Task, item: WorkItem, first: int) -> Iterator[tuple[int, np.
 @tf.one_torch_thread()
 @torch.no_grad()
 def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.ndarray, str]]:
-    observed, each = observed_of(task), task.replicates
+    observed, each = observed_of(task), task.replicates * task.conditions
     streams = [(first + row) * each + k for row in item.rows for k in range(each)]
-    scene = task.family.scene(item.values, repeat=each)
+    scene = task.family.scene(item.values, repeat=task.replicates)
     prepared = colonies.prepare(scene, streams, task.settings)
     found = np.full((len(streams), len(observed.values)), np.nan)
     reasons: dict[int, str] = {}
@@ -175,7 +177,10 @@ def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.nda
             if why:  # it has stopped before the data were observed
                 found[colony_id] = np.nan
                 reasons[colony_id // each] = why
-    means = found.reshape(len(item.rows), each, -1).mean(1)
+    # of the colonies of a replicate, each statistic is that of the one under its condition
+    places, columns = observed.places, np.arange(len(observed.values))
+    shape = (len(item.rows), task.replicates, task.conditions, len(columns))
+    means = found.reshape(shape)[:, :, places, columns].mean(1)
     for k in np.flatnonzero(~np.isfinite(means).all(1)).tolist():
         reasons.setdefault(k, "a statistic is not finite")
     return [(row, means[k], reasons.get(k, "")) for k, row in enumerate(item.rows)]

@@ -70,7 +70,7 @@ class Conditions(Several):
         """A condition in words."""
         return ", ".join(f"{name} = {value:g}" for name, value in self.arguments[place].items())
 
-    def _own(self, state: tf.State) -> Tensor:
+    def condition_of(self, state: tf.State) -> Tensor:
         """The condition of each colony, (B,): those of a replicate stand side by side."""
         return state.colony_id % len(self.parts)
 
@@ -79,17 +79,19 @@ class Conditions(Several):
 
     def unfit(self, state: tf.State) -> list[str]:
         each = [part.unfit(state) for part in self.parts]
-        return [each[own][k] for k, own in enumerate(self._own(state).tolist())]
+        return [each[own][k] for k, own in enumerate(self.condition_of(state).tolist())]
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
-        return self.losses(state, history).gather(1, self._own(state).unsqueeze(1)).squeeze(1)
+        return (
+            self.losses(state, history).gather(1, self.condition_of(state).unsqueeze(1)).squeeze(1)
+        )
 
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
-        each = self._each(lambda part, own: part.measures(state, own), state, history)
+        each = self.of_parts(lambda part, own: part.measures(state, own), state, history)
         return {self._named(n, k): x for k, part in enumerate(each) for n, x in part.items()}
 
     def concerns(self, measure: str, state: tf.State) -> Tensor:
-        return self._own(state) == self._of(measure)[1]
+        return self.condition_of(state) == self._of(measure)[1]
 
     def _named(self, name: str, place: int) -> str:
         return f"{name} ({self.label(place)})"
@@ -118,11 +120,11 @@ class Conditions(Several):
 
     def reaches(self, state: tf.State) -> Tensor:
         each = torch.stack([part.reaches(state) for part in self.parts], 1)
-        return each.gather(1, self._own(state).unsqueeze(1)).squeeze(1)
+        return each.gather(1, self.condition_of(state).unsqueeze(1)).squeeze(1)
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        each = self._each(lambda part, own: (part, own), state, history)
-        part, own = each[int(self._own(state)[place])]
+        each = self.of_parts(lambda part, own: (part, own), state, history)
+        part, own = each[int(self.condition_of(state)[place])]
         part.draw(ax, state, place, own)
 
     def describe(self) -> str:

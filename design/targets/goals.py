@@ -147,7 +147,7 @@ class Weighted(Several):
 
     def _courses(self, state: tf.State, history: Tensor) -> list[Tensor | None]:
         """What `course` kept of each part, (T, B, k), or what `note` did."""
-        notes = self._each(lambda part, own: own, state, history)
+        notes = self.of_parts(lambda part, own: own, state, history)
         first = sum(0 if n is None else n.shape[2] for n in notes)
         if history.shape[2] == first:
             return notes
@@ -259,7 +259,7 @@ class Constrained(Several):
         """Of a state alone: the measures of each part."""
         note = self.note(state)
         history = None if note is None else note.unsqueeze(0)
-        return self._each(lambda part, own: part.measures(state, own), state, history)
+        return self.of_parts(lambda part, own: part.measures(state, own), state, history)
 
     def bounding(self, state: tf.State) -> list[Target]:
         """Those of its targets that have the measures of the constraints."""
@@ -278,7 +278,7 @@ class Constrained(Several):
         return out
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
-        own = self._each(lambda part, own: part.loss(state, own).double(), state, history)[0]
+        own = self.of_parts(lambda part, own: part.loss(state, own).double(), state, history)[0]
         missed = self.missed(state, history)
         share = torch.where(missed.isinf(), 1.0, missed / (1.0 + missed))
         # a colony without a loss has failed, whatever it misses

@@ -71,7 +71,7 @@ class Several(Target):
     def kept(self, state: tf.State) -> float:
         return sum(part.kept(state) for part in self.parts)
 
-    def _each(
+    def of_parts(
         self, of: Callable[[Target, Tensor | None], Any], state: tf.State, history: Tensor | None
     ) -> list[Any]:
         """Something of every part, with its own columns of the history."""
@@ -86,7 +86,7 @@ class Several(Target):
 
     def losses(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         """The loss of every part, (B, parts)."""
-        each = self._each(lambda part, own: part.loss(state, own).double(), state, history)
+        each = self.of_parts(lambda part, own: part.loss(state, own).double(), state, history)
         return torch.stack(each, 1)
 
     @property
@@ -118,11 +118,11 @@ class Several(Target):
         return next(filter(None, each), "")
 
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
-        each = self._each(lambda part, own: part.measures(state, own), state, history)
+        each = self.of_parts(lambda part, own: part.measures(state, own), state, history)
         return {name: value for part in each for name, value in part.items()}
 
     def reaches(self, state: tf.State) -> Tensor:
         return torch.stack([part.reaches(state) for part in self.parts]).any(0)
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        self._each(lambda part, own: part.draw(ax, state, place, own), state, history)
+        self.of_parts(lambda part, own: part.draw(ax, state, place, own), state, history)

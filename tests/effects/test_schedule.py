@@ -364,7 +364,7 @@ def test_a_change_within_a_step_is_warned_of():
         (lambda: tf.Signal(1.0, decay=tf.Schedule({0: 1.0})), "constant. A Schedule is for"),
         (lambda: tf.Growth(rate=tf.Schedule({0: 1.0})), "constant. A Schedule is for"),
         (lambda: tf.Signal(1.0, flow=tf.Schedule({0: 3.0})), "from 0 h = 3.0"),
-        (lambda: tf.Signal(1.0, flow=(tf.Schedule({0: 3.0}), 0.0)), "a schedule is one of whole velocities"),
+        (lambda: tf.Signal(1.0, flow=(tf.Schedule({0: 3.0}), 0.0)), "is one of whole velocities"),
         (
             lambda: tf.Schedule({0: tf.Schedule({0: 1.0})}),
             "Schedule.values, from 0 h = Schedule",

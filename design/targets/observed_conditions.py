@@ -1,0 +1,128 @@
+"""Data of colonies that were observed under several conditions, for inference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import cast
+
+import torch
+from torch import Tensor
+
+import torchfilm as tf
+from design.targets.conditions import Conditions
+from design.targets.observed import Observed
+from design.targets.observed_course import CourseStatistics
+from design.targets.statistics import ColonyStatistics
+from torchfilm import checks
+
+
+@dataclass(frozen=True)
+class ConditionStatistics:
+    """The statistics of each of several conditions, those of `plans`; `labels` are the conditions
+    in words."""
+
+    plans: tuple[ColonyStatistics | CourseStatistics, ...]
+    labels: tuple[str, ...]
+
+    @property
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """The names of the statistics by what they are about, under each condition."""
+        pairs = zip(self.plans, self.labels, strict=True)
+        return {
+            _under(group, label): tuple(_under(name, label) for name in names)
+            for plan, label in pairs
+            for group, names in plan.groups.items()
+        }
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all statistics, (K,)."""
+        return tuple(name for names in self.groups.values() for name in names)
+
+    @property
+    def species(self) -> tuple[str, ...]:
+        """All reporters."""
+        return tuple(dict.fromkeys(n for plan in self.plans for n in plan.species))
+
+
+@dataclass(frozen=True, init=False)
+class ObservedConditions(Observed):
+    """The data of `conditions` as one: the statistics of all, each with its condition in its name,
+    such as "gfp_mean (iptg = 10)".
+
+    Raises InputError for conditions that are not all data, of different numbers of colonies, or
+    where colonies would not end at one time.
+    """
+
+    plan: ConditionStatistics  # type: ignore[assignment]
+    conditions: Conditions = field(repr=False)
+
+    def __init__(self, conditions: Conditions):
+        parts = _checked(conditions)
+        labels = tuple(conditions.label(k) for k in range(len(parts)))
+        found = {
+            "conditions": conditions,
+            "values": tuple(v for part in parts for v in part.values),
+            "spread": tuple(v for part in parts for v in part.spread),
+            "plan": ConditionStatistics(tuple(part.plan for part in parts), labels),
+            "colonies": parts[0].colonies,
+            "cells": sum(part.cells for part in parts),
+            "time": parts[0].time,
+        }
+        for name, value in found.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def grown(self) -> Conditions:
+        return self.conditions
+
+    @property
+    def places(self) -> list[int]:
+        parts = enumerate(self.conditions.parts)
+        return [k for k, part in parts for _ in cast(Observed, part).values]
+
+    def unfit(self, state: tf.State) -> list[str]:
+        return self.conditions.unfit(state)
+
+    def note(self, state: tf.State) -> Tensor | None:
+        return self.conditions.note(state)
+
+    def statistics(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        """Of each colony those of its condition, (B, K) float64, and NaN in place of others."""
+        of = lambda part, own: cast(Observed, part).statistics(state, own)
+        each = self.conditions.of_parts(of, state, history)
+        mine = self.conditions.condition_of(state).unsqueeze(1)
+        return torch.cat([x.where(mine == k, torch.nan) for k, x in enumerate(each)], 1)
+
+    def describe(self) -> str:
+        many = f"{self.colonies} observed colon" + ("ies" if self.colonies > 1 else "y")
+        when = "" if self.time is None else f" at {self.time:g} h"
+        groups = dict.fromkeys(g for plan in self.plan.plans for g in plan.groups)
+        under = f"under each of {len(self.plan.labels)} conditions{when}"
+        return f"like {many} {under}, {self.cells} cells in all: {', '.join(groups)}"
+
+
+def one_observed(data: object) -> object:
+    """Data of several conditions as one; anything else as it is."""
+    return ObservedConditions(data) if isinstance(data, Conditions) else data
+
+
+def _checked(conditions: Conditions) -> tuple[Observed, ...]:
+    parts = tuple(part for part in conditions.parts if isinstance(part, Observed))
+    if len(parts) < len(conditions.parts):
+        other = next(part for part in conditions.parts if not isinstance(part, Observed))
+        rule = "of data under every condition: Observed, or ObservedCourse"
+        raise checks.input_error("Conditions.terms", other, rule)
+    for what, of in (
+        ("colonies", [part.colonies for part in parts]),
+        ("time", [part.time for part in parts]),
+    ):
+        if len(set(of)) > 1:
+            rule = f"of the same {what} under every condition, since they are simulated together"
+            raise checks.input_error(f"{what} of Conditions", of, rule)
+    return parts
+
+
+def _under(name: str, label: str) -> str:
+    """The name of a statistic, or a group, under a condition."""
+    return f"{name} ({label})"
