@@ -32,20 +32,21 @@ class Gathered:
         """Colonies that have failed, whose loss has no slope."""
         self.slopes.gradient[colonies], self.slopes.curvature[colonies] = 0.0, np.nan
 
-    def add(self, target: Target, finished: FinishedColonies, colony: list[int]) -> None:
-        """The copies of colonies: of each, one after the other, all its copies. colony: the
-        colony of each first copy."""
-        copies = len(self.directions)
+    def add(
+        self, target: Target, finished: FinishedColonies, colony: list[int], places: np.ndarray
+    ) -> None:
+        """The copies of colonies, at these places of the batch, (n, copies). colony: the number of
+        each colony."""
         loss = tf.tangents.both(target.loss(finished.state, finished.history))[1]
         if loss is not None:
-            slopes = loss.double().cpu().numpy().reshape(-1, copies)
+            slopes = loss.double().cpu().numpy()[places]
             self.slopes.gradient[np.ix_(colony, self.directions)] = slopes
         found = target.residuals(finished.state, finished.history)
         if found is None:
             return
         value, tangent = tf.tangents.both(found)
         turned = torch.zeros_like(value) if tangent is None else tangent
-        of_colonies = turned.double().cpu().numpy().reshape(-1, copies, value.shape[1])
+        of_colonies = turned.double().cpu().numpy()[places]
         for k, padded in zip(colony, of_colonies, strict=True):
             # zeros stand beyond a colony's own cells, as many as its batch needs: with them the
             # product would have other bits in another batch

@@ -18,7 +18,7 @@ from design.progress import advance, open_bar
 from design.simulations import Simulations, simulate_designs
 from design.targets.conditions import Conditions
 from design.targets.observed import Observed
-from design.targets.observed_conditions import one_observed
+from design.targets.observed_conditions import grown, one_observed
 from design.task import Task
 from torchfilm import checks
 
@@ -81,7 +81,7 @@ def infer(
     _check_end(data.time, cells, until)
     kept = None if path is None else checks.file_path("path", path)
     task = Task(
-        scene, parameters, data.grown, cells=cells,
+        scene, parameters, grown(data), cells=cells,
         until=data.time if until is None and cells is None else until,
         replicates=data.colonies if replicates is None else replicates,
         fixed=fixed, seed=seed, dt=dt, dtype=dtype, device=device, replay=False,

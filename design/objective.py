@@ -181,7 +181,7 @@ class Objective(metaclass=checks.KnownKeywords):
             if found.slopes is not None:
                 gathered.put([row * count + k for row in rows for k in range(count)], found.slopes)
         slopes = None if tangents is None else gathered.reduced(task.shares(losses))
-        copies = task.conditions if tangents is None else len(tangents[0])
+        copies = task.conditions * (1 if tangents is None else len(tangents[0]))
         return Evaluation(
             points, values, losses, task.reduced(losses), cells, reasons, size, why_regrown, 0.0,
             slopes, copies, task.reduced_goals(goals), goals if task.goals else None,

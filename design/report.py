@@ -14,7 +14,6 @@ from design.parameters import Choice, Parameter, Space, Value, show_value
 from design.study import Study
 from design.targets.base import Target
 from design.targets.goals import Constrained, Goals
-from design.targets.observed import Observed
 from design.task import Task
 from design.trivial import EVERY_SECOND, trivial_losses
 
@@ -189,8 +188,8 @@ def _warnings(report: SearchReport) -> list[str]:
             f" of {least!r}, and a good one {SUCCESS:g} or less. Simulate more colonies, free more"
             " parameters, or grow larger colonies."
         )
-    if isinstance(target, Observed) and best.loss > FITS:
-        lines.append(_poor_fit(target, best))
+    if best.loss > FITS and (words := _misses(target, best)):
+        lines.append(words)
     if not report.task.goals and report.first.loss < best.loss:
         lines.append(
             "the first guess has a smaller loss on the seeds of the search. If the search did not"
@@ -243,15 +242,18 @@ def _undefined(target: Target, found: Mapping[str, list[float]]) -> list[str]:
     return [f"{name} is undefined: {why}." for name, why in reasons.items() if why]
 
 
-def _poor_fit(target: Observed, best: ReportedDesign) -> str:
-    """What a design that is unlike the data misses most."""
-    seen, found = target.evidence, measured(target, best.colonies)
-    apart = {n: abs(found[n] - value) / by for n, (value, by) in seen.items() if n in found}
-    worst = sorted((n for n in apart if np.isfinite(apart[n])), key=lambda n: -apart[n])[:WORST]
+def _misses(target: Target, best: ReportedDesign) -> str:
+    """What a design that is unlike the data, or what was wanted, misses most; "" where the target
+    has no spreads."""
+    apart = target.misses(measured(target, best.colonies))
+    worst = sorted((n for n in apart if apart[n] > 1), key=lambda n: -apart[n])[:WORST]
+    if not worst:
+        return ""
     words = ", ".join(f"{n} by {apart[n]:.1f} spreads" for n in worst)
+    like = "colonies that grew as the observed ones did have a loss of about 1. "
     return (
-        "colonies that grew as the observed ones did have a loss of about 1. The best design is off"
-        f" most in {words}. Search longer, free more parameters, or change the model."
+        f"{like if target.evidence else ''}The best design is off most in {words}. Search longer,"
+        " free more parameters, or change the model."
     )
 
 

@@ -68,7 +68,7 @@ def cut_work_items(
     whole = WorkItem(
         tuple(range(len(values))), tuple(values), None if tangents is None else tuple(tangents)
     )
-    colonies_each = replicates * (task.conditions if tangents is None else len(tangents[0]))
+    colonies_each = replicates * task.conditions * (1 if tangents is None else len(tangents[0]))
     structural = [p.name for p in task.space.parameters if p.structural]
     groups: dict[tuple[str, ...], list[int]] = {}
     for row, design in enumerate(values):
@@ -171,8 +171,8 @@ def _goals(task: Task, part: WorkResult, replicates: int) -> np.ndarray:
 def _grow_and_score(
     task: Task, item: WorkItem, streams: tuple[int, ...], size: float
 ) -> WorkResult:
-    """Copies of a colony, one for each derivative, stand side by side in the batch; or those of a
-    replicate, one under each condition, which have no derivatives."""
+    """The colonies of a replicate stand side by side in the batch: one under each condition, and
+    these again for each derivative."""
     count, replicates = len(item.rows), len(streams) * task.conditions
     copies = 1 if item.tangents is None else len(item.tangents[0])
     with tf.tangents.forward_mode() if item.tangents else contextlib.nullcontext():
@@ -185,7 +185,7 @@ def _grow_and_score(
         if item.tangents and why_rough(scene, prepared.why_regrown):
             # no slope is better than a wrong one
             plain = _grow_and_score(task, replace(item, tangents=None), streams, size)
-            return replace(plain, slopes=Slopes.unknown(count * replicates, task.space.size))
+            return replace(plain, slopes=Slopes.unknown(count * len(streams), task.space.size))
         losses = np.full(count * replicates, task.target.failed, np.float64)
         goals = np.full((count * replicates, task.goals), np.nan)
         cells = np.zeros(count * replicates, np.int64)
@@ -196,22 +196,25 @@ def _grow_and_score(
         fewest = task.target.fewest
         for event in grow(prepared, cells=most_cells, until=until, note=note, fewest=fewest):
             if not isinstance(event, FinishedColonies):
-                reasons[divmod(event.colony_id // copies, replicates)] = event.reason
+                number = int(_numbers([event.colony_id], task.conditions, copies)[0])
+                reasons[divmod(number, replicates)] = event.reason
                 continue
-            ids = [k // copies for k in event.state.colony_id.tolist()[::copies]]
-            score = _scores(task.target, event)[::copies]
+            numbers = _numbers(event.state.colony_id.tolist(), task.conditions, copies)
+            places = _places(numbers, copies)
+            first, ids = places[:, 0], numbers[places[:, 0]].tolist()
+            score = _scores(task.target, event)[first]
             score, why = _below_failed(task.target, score)
             reasons |= {divmod(ids[k], replicates): words for k, words in why.items()}
-            unfit = _unfit(task, event.state, size)[::copies]
+            unfit = [_unfit(task, event.state, size)[k] for k in first]
             reasons |= {divmod(k, replicates): w for k, w in zip(ids, unfit, strict=True) if w}
             good = np.isfinite(score) & np.array([not why for why in unfit])
             losses[ids] = np.where(good, score, task.target.failed)
             if isinstance(task.target, Goals):
-                each = task.target.losses(event.state, event.history)[::copies].cpu().numpy()
+                each = task.target.losses(event.state, event.history).cpu().numpy()[first]
                 goals[ids] = np.where(good[:, None], each, np.nan)
-            cells[ids] = event.state.counts.cpu().numpy()[::copies]
+            cells[ids] = event.state.counts.cpu().numpy()[first]
             if gathered is not None:
-                gathered.add(task.target, event, ids)
+                gathered.add(task.target, event, ids, places)
                 gathered.forget([k for k, well in zip(ids, good, strict=True) if not well])
     shape, slopes = (count, replicates), None if gathered is None else gathered.slopes
     found = WorkResult(
@@ -219,6 +222,17 @@ def _grow_and_score(
         goals.reshape(*shape, task.goals),
     )  # fmt: skip
     return found if task.conditions == 1 else _of_replicates(task, found)
+
+
+def _numbers(ids: Sequence[int], conditions: int, copies: int) -> np.ndarray:
+    """The numbers of colonies with these ids, (B,), among those without copies."""
+    block, rest = np.divmod(np.asarray(ids), conditions * copies)
+    return block * conditions + rest % conditions
+
+
+def _places(numbers: np.ndarray, copies: int) -> np.ndarray:
+    """Where the copies of each colony are in the batch, (n, copies), from the lowest number on."""
+    return np.argsort(numbers, kind="stable").reshape(-1, copies)
 
 
 def _of_replicates(task: Task, found: WorkResult) -> WorkResult:
@@ -233,7 +247,12 @@ def _of_replicates(task: Task, found: WorkResult) -> WorkResult:
     for place in reasons:
         losses[place] = task.target.failed
     cells = found.cells.reshape(shape).min(2)
-    return replace(found, losses=losses, cells=cells, reasons=reasons, goals=None)
+    slopes = found.slopes
+    if slopes is not None:
+        slopes = slopes.reduced(np.full((losses.size, task.conditions), 1.0 / task.conditions))
+        failed = [row * losses.shape[1] + replicate for row, replicate in reasons]
+        slopes.put(failed, Slopes.none(len(failed), task.space.size))
+    return replace(found, losses=losses, cells=cells, reasons=reasons, slopes=slopes, goals=None)
 
 
 def _below_failed(target: Target, score: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:

@@ -25,7 +25,7 @@ from design.parameters import Value
 from design.prior import Prior
 from design.scoring import WorkItem, cut_work_items
 from design.targets.observed import Observed
-from design.targets.observed_conditions import one_observed
+from design.targets.observed_conditions import one_observed, places
 from design.task import Task
 from torchfilm import checks
 
@@ -178,9 +178,9 @@ def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.nda
                 found[colony_id] = np.nan
                 reasons[colony_id // each] = why
     # of the colonies of a replicate, each statistic is that of the one under its condition
-    places, columns = observed.places, np.arange(len(observed.values))
+    columns = np.arange(len(observed.values))
     shape = (len(item.rows), task.replicates, task.conditions, len(columns))
-    means = found.reshape(shape)[:, :, places, columns].mean(1)
+    means = found.reshape(shape)[:, :, places(observed), columns].mean(1)
     for k in np.flatnonzero(~np.isfinite(means).all(1)).tolist():
         reasons.setdefault(k, "a statistic is not finite")
     return [(row, means[k], reasons.get(k, "")) for k, row in enumerate(item.rows)]

@@ -98,7 +98,7 @@ def test_cells_burst_and_signals_react_where_they_are(pretended_cuda, kinds):  #
         for _ in range(6):
             state = step(scene, state, 0.05)
         assert not tf.failures(state) and state.cells < 40
-        return state, tf.measure.pressure(state, scene, dt=0.05), tf.cell_table(state)
+        return state, tf.measure.pressure(state, scene), tf.cell_table(state)
 
     (there, press, table), (here, right, own) = run("cuda"), run("cpu")
     assert press.device.type == "cuda" and there.reports["lysis"].burst.device.type == "cuda"

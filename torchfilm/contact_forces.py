@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 END_ON = 1e-4  # squared sine of the angle between a cell and a force on its end
 
 
-def softness(measure: str, state: State, dt: float) -> Tensor:
-    """α Δt of each cell's contacts in a step of dt hours, or in its sub-steps, (N,): a contact
-    pushes with its overlap over this."""
+def softness(measure: str, state: State) -> Tensor:
+    """α Δt of each cell's contacts in the last step, or in its sub-steps, (N,): a contact pushes
+    with its overlap over this."""
     if "contact_alpha" not in state.fields:
         raise checks.InputError(
             f"{measure}: the state has no contact_alpha, the softness of one-sided contacts:"
@@ -37,11 +37,11 @@ def softness(measure: str, state: State, dt: float) -> Tensor:
     report: Any = state.reports.get("mechanics")
     if report is None:
         raise checks.InputError(
-            f"{measure}: the state does not say in how many sub-steps its contacts were solved."
+            f"{measure}: the state does not say in which steps its contacts were solved."
             " Give it as a step returns it: not a first one, nor one from a file or by select."
         )
     steps = state.groups.spread(report.substeps.clamp(min=1))
-    return state.contact_alpha.double() * dt / steps
+    return state.contact_alpha.double() * report.dt / steps
 
 
 @dataclass(frozen=True)

@@ -100,24 +100,23 @@ class WallForces:
 
 @of_a_state
 @torch.no_grad()
-def wall_forces(state: State, walls: Sequence[Wall] | Scene, dt: float | None = None) -> WallForces:
-    """The forces on walls in the last step, of dt hours, by one-sided contacts.
+def wall_forces(state: State, walls: Sequence[Wall] | Scene) -> WallForces:
+    """The forces on walls in the last step, by one-sided contacts.
 
     A contact pushes with its overlap / (α Δt), on a soft wall with its overlap × stiffness. Divide
     by the length of a wall (2-D) or its area for the pressure, averaged over steps: one step's is
     as exact as its solve. walls: the scene; or the walls of its Mechanics, whose stiffness is not
-    drawn, with the dt. Only with the scene the pull of `tf.Adhesion` to walls counts, a force below
-    0; that of bonds that broke in this step does not. dt: h, by default that of the scene.
+    drawn. Only with the scene the pull of `tf.Adhesion` to walls counts, a force below 0; that of
+    bonds that broke in this step does not. Raises InputError as `pressure` does.
     """
     from torchfilm.scene import Scene  # it imports rooms that measure
 
     if isinstance(walls, Scene):
         bonds, surfaces = bonds_of(state, walls), walls.wall_surfaces()
-        dt = walls.dt if dt is None else dt
     else:
         _check_walls("wall_forces", walls)
         bonds, surfaces = None, [s for wall in walls for s in wall.surfaces(state.dim)]
-    soft = softness("wall_forces", state, checks.number("wall_forces(dt)", dt, above=0.0))
+    soft = softness("wall_forces", state)
     pushes = pushed_by_walls(state, surfaces, soft, bonds)
     assert pushes.surface is not None
     at = state.colony.index_select(0, pushes.cell) * len(surfaces) + pushes.surface
@@ -129,7 +128,7 @@ def wall_forces(state: State, walls: Sequence[Wall] | Scene, dt: float | None = 
 @of_a_state
 @one_torch_thread()
 @torch.no_grad()
-def pressure(state: State, scene: Scene, dt: float | None = None) -> Tensor:
+def pressure(state: State, scene: Scene) -> Tensor:
     """The pressure on each cell in the last step, (N,) float64, by one-sided contacts.
 
     It is that of the stress in the cell: the sum of force times the distance of the contact from
@@ -137,20 +136,18 @@ def pressure(state: State, scene: Scene, dt: float | None = None) -> Tensor:
     scene d = 2 and its area as seen from above, μ·µm/h, else d = 3, μ/h. Cells carry what the gaps
     between them do not: in a full chamber the mean, weighted by size, is the pressure on the walls
     over the share of the chamber that the cells fill. Overlaps give the forces with an error of
-    second order in dt: in a full chamber, where cells still shift, 5 % at 0.025 h, 0.5 % at
-    0.00625 h. Adhesion pulls: where it does so more than contacts push, the pressure is below 0.
-    Bonds that broke in this step do not count.
-    dt: of the last step, h; by default that of the scene.
+    second order in dt, since cells grow and are pushed back within a step: in a full chamber they
+    are 3 to 5 % too small at 0.025 h, 0.5 % at 0.00625 h. Adhesion pulls: where it does so more
+    than contacts push, the pressure is below 0. Bonds that broke in this step do not count.
 
     Raises InputError for bilateral contacts, and for a state that is not as a step returned it: it
-    lacks the number of sub-steps.
+    lacks the step and the number of sub-steps.
     """
     from torchfilm.scene import Scene  # it imports rooms that measure
 
     if not isinstance(scene, Scene):
         raise checks.input_error("pressure(scene)", scene, "the tf.Scene of the state")
-    dt = checks.number("pressure(dt)", scene.dt if dt is None else dt, above=0.0)
-    soft = softness("pressure", state, dt)
+    soft = softness("pressure", state)
     surfaces = scene.wall_surfaces()
     soft_cells = any(e.soft_contacts for e in scene.effects)
     total = torch.zeros_like(soft)

@@ -260,7 +260,7 @@ class State:
             raise checks.input_error(
                 "field",
                 sorted(values.keys() - self.declared.keys()),
-                f"declared; known are {', '.join(self.declared) or 'none'}",
+                f"declared: {', '.join(self.declared) or 'none'}; parts have replace(position=…)",
             )
         row_checks.check_tensors(values, self.fields, self.device, self._shape_of)
         return self.replace(fields={**self.fields, **values})

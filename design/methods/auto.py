@@ -19,6 +19,7 @@ BATCH, WIDTH = 24, 0.5
 # designs before the first descents (less than one race, whose end they await), and for each
 # parameter of a descent, so that it ends
 BEFORE, EACH, MOST_STARTS = 5, 10, 3
+BEFORE_FIT = 16  # designs before the descents of a fit, which no small colonies help
 # designs of a batch of a race where every design needs many replicates
 FEW = 12
 # designs of a batch of a model, and at most in a search, since its time grows as the cube of all
@@ -61,9 +62,8 @@ def choose(
     budget can grow with all replicates; goals: 0 for one target; pattern: whether the target is a
     pattern, of which small colonies show something; squares: whether its loss is a sum of squares
     with exact derivatives; chance: whether molecules are counted one by one; replicates: of a
-    design; before: what the study of a search that is resumed says of its method, which goes
-    on; different: designs in the space; searched: those that the budget grows
-    before the finals."""
+    design; before: what the study of a search that is resumed says of its method, which goes on;
+    different: designs in the space; searched: those that the budget grows before the finals."""
     botorch, cloud = find_spec("botorch") is not None, CMAES(population=BATCH, sigma=WIDTH)
     alone = chance or not pattern  # the model draws all designs
     most, least = MODELLED if alone else RACED, LEAST_RACED if pattern else 0
@@ -98,8 +98,8 @@ def choose(
             f"{about}: {luck if pattern else data}; a model of the loss knows that colonies differ"
             " by luck",
         )
-    descents = _descents(cloud, about)
-    known = (few, race, *descents, *((learnt, modelled) if botorch else ()))
+    descents, fits = _descents(cloud, about), _fits(cloud, data)
+    known = (few, race, *descents, *fits, *((learnt, modelled) if botorch else ()))
     every = Chosen(Exhaustive(), f"{different:g} different designs: the budget grows each")
     if begun := [x for x in (*known, every) if x.describe() == before]:
         return Chosen(begun[0].method, "the study began with it")
@@ -109,9 +109,10 @@ def choose(
         return every
     if designs < least:
         return few
-    room = int((designs - BEFORE) / (EACH * dimensions))
-    if squares and room and not alone and designs >= LEAST_RACED:
-        return descents[min(room, MOST_STARTS) - 1]
+    ways, first = (descents, BEFORE) if pattern else (fits, BEFORE_FIT)
+    starts = min(int((designs - first) / (EACH * dimensions)), MOST_STARTS)
+    if squares and starts > 0 and not chance and (designs >= LEAST_RACED or not pattern):
+        return ways[starts - 1]
     if designs > most or not botorch:
         return race if pattern else fit
     return modelled if alone else learnt
@@ -132,6 +133,18 @@ def _descents(cloud: CMAES, about: str) -> tuple[Chosen, ...]:
             Polish(inner=Racing(inner=cloud), after=BEFORE, starts=starts),
             f"{about}: one race of small colonies, then by gradients from the best, of one"
             " replicate at first, since the loss is a sum of squares with exact derivatives",
+        )
+        for starts in range(1, MOST_STARTS + 1)
+    )
+
+
+def _fits(cloud: CMAES, data: str) -> tuple[Chosen, ...]:
+    """Descents of a fit to data, from one start and from more, side by side."""
+    return tuple(
+        Chosen(
+            Polish(inner=cloud, after=BEFORE_FIT, starts=starts),
+            f"{data}; {BEFORE_FIT} designs of CMA-ES, then by gradients from the best, since the"
+            " loss is a sum of squares with exact derivatives",
         )
         for starts in range(1, MOST_STARTS + 1)
     )

@@ -153,6 +153,11 @@ class Target(metaclass=checks.KnownKeywords):
         """What was observed of each measure, and its spread, where the target is data."""
         return {}
 
+    def misses(self, found: Mapping[str, float]) -> dict[str, float]:
+        """By how many spreads each of these measures is off, where the target has spreads."""
+        seen = self.evidence.items()
+        return {n: abs(found[n] - value) / by for n, (value, by) in seen if n in found}
+
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         """Measures of the pattern that a colony has, (B,) by name; NaN where one is not
         defined."""

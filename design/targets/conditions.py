@@ -12,7 +12,7 @@ from torch import Tensor
 import torchfilm as tf
 from design.targets.base import Target
 from design.targets.goals import of_colonies
-from design.targets.several import Several
+from design.targets.several import SumOfTargets
 from torchfilm import checks
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Conditions(Several):
+class Conditions(SumOfTargets):
     """A design that does something else under each of several conditions, such as a gate:
 
         Conditions([({"iptg": 0.0}, dark), ({"iptg": 1.0}, lit)])
@@ -28,8 +28,8 @@ class Conditions(Several):
     terms: pairs of arguments of the scene function, numbers by name, and the target under these.
     Each replicate of a design is one colony under each condition, all with the same random numbers.
     Its loss is the mean of theirs. A replicate fails where one of its colonies does. Measures bear
-    the name of their condition. Derivatives are differences between runs. It stands outermost:
-    other targets may be in it, and it in none.
+    the name of their condition. It has residuals and exact derivatives where its targets have. It
+    stands outermost: other targets may be in it, and it in none.
     """
 
     terms: Sequence[tuple[Mapping[str, float], Target]]
@@ -74,9 +74,6 @@ class Conditions(Several):
         """The condition of each colony, (B,): those of a replicate stand side by side."""
         return state.colony_id % len(self.parts)
 
-    def why_rough(self, state: tf.State) -> str:
-        return "it has several conditions"
-
     def unfit(self, state: tf.State) -> list[str]:
         each = [part.unfit(state) for part in self.parts]
         return [each[own][k] for k, own in enumerate(self.condition_of(state).tolist())]
@@ -85,6 +82,13 @@ class Conditions(Several):
         return (
             self.losses(state, history).gather(1, self.condition_of(state).unsqueeze(1)).squeeze(1)
         )
+
+    def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor | None:
+        each = self.of_courses(state, history)
+        if each is None:
+            return None
+        mine = self.condition_of(state).unsqueeze(1)
+        return torch.cat([x.where(mine == k, 0.0) for k, x in enumerate(each)], 1)
 
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         each = self.of_parts(lambda part, own: part.measures(state, own), state, history)
@@ -108,6 +112,14 @@ class Conditions(Several):
     def bounds(self) -> dict[str, str]:
         each = enumerate(part.bounds for part in self.parts)
         return {self._named(n, k): b for k, bounds in each for n, b in bounds.items()}
+
+    def misses(self, found: Mapping[str, float]) -> dict[str, float]:
+        out: dict[str, float] = {}
+        for k, part in enumerate(self.parts):
+            own = {self._of(name): x for name, x in found.items()}
+            mine = {name: x for (name, place), x in own.items() if place == k}
+            out |= {self._named(n, k): by for n, by in part.misses(mine).items()}
+        return out
 
     @property
     def evidence(self) -> dict[str, tuple[float, float]]:

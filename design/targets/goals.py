@@ -22,7 +22,7 @@ from design.targets.base import (
     valid_levels,
     weights,
 )
-from design.targets.several import Several
+from design.targets.several import Several, SumOfTargets
 from torchfilm import checks
 
 CONCENTRATION = "conc"  # the unit of species
@@ -86,7 +86,7 @@ class Duration(Target):
 
 
 @dataclass(frozen=True)
-class Weighted(Several):
+class Weighted(SumOfTargets):
     """The sum of the losses of several targets: `Weighted([(Stripe(…), 1.0), (Burden(), 0.1)])`.
     Weights are above 0."""
 
@@ -124,51 +124,13 @@ class Weighted(Several):
         each = [loss * weight for loss, (_, weight) in zip(found, self.terms, strict=True)]
         return sum(each[1:], each[0])
 
-    def course(self, state: tf.State) -> Tensor | None:
-        """The notes of all parts, how many columns each needs besides, and these."""
-        courses, notes = [p.course(state) for p in self.parts], [p.note(state) for p in self.parts]
-        sizes = [0 if n is None else n.shape[1] for n in notes]
-        more = [None if c is None else c[:, k:] for c, k in zip(courses, sizes, strict=True)]
-        widths = [0 if m is None else m.shape[1] for m in more]
-        found = [n for n in notes if n is not None]
-        if not found:
-            return None
-        told = found[0].new_tensor(widths).expand(state.colonies, -1)
-        return torch.cat([*found, told, *(m for m in more if m is not None)], 1)
-
     def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor | None:
-        courses = [history] * len(self.parts) if history is None else self._courses(state, history)
-        each = [p.residuals(state, own) for p, own in zip(self.parts, courses, strict=True)]
-        if any(found is None for found in each):
+        each = self.of_courses(state, history)
+        if each is None:
             return None
         return torch.cat(
             [found * weight**0.5 for found, (_, weight) in zip(each, self.terms, strict=True)], 1
         )
-
-    def _courses(self, state: tf.State, history: Tensor) -> list[Tensor | None]:
-        """What `course` kept of each part, (T, B, k), or what `note` did."""
-        notes = self.of_parts(lambda part, own: own, state, history)
-        first = sum(0 if n is None else n.shape[2] for n in notes)
-        if history.shape[2] == first:
-            return notes
-        told = tf.tangents.both(history[:, :, first : first + len(notes)])[0]
-        # a colony that has ended has no number
-        widths = told.nan_to_num().amax(1).long()
-        begin, widest = first + len(notes), widths.amax(0).tolist()
-        steps = [
-            row[:, begin : begin + sum(own)].split(own, 1)
-            for row, own in zip(history, widths.tolist(), strict=True)
-        ]
-        out: list[Tensor | None] = []
-        for k, note in enumerate(notes):
-            pad = [(0, widest[k] - more[k].shape[1]) for more in steps]
-            more = [torch.nn.functional.pad(m[k], p) for m, p in zip(steps, pad, strict=True)]
-            out.append(None if note is None else torch.cat([note, torch.stack(more)], 2))
-        return out
-
-    @property
-    def squares(self) -> bool:
-        return all(part.squares for part in self.parts)
 
     def describe(self) -> str:
         return " + ".join(f"{weight:g} × {part.describe()}" for part, weight in self.terms)

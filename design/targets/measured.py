@@ -32,6 +32,10 @@ class Measured(Target):
     failed, and so has one in which no cell is left; with extinct=True that one is measured, too, as
     where a drug is to kill all; among several goals, if all of them can be so. For several
     processes, functions stand at the top level of a file.
+
+    smooth: say True where the functions have derivatives by all that the parameters change, as
+    means of levels have, and counts of cells do not: then least squares search with exact
+    derivatives, where the scene has them. Where a function has none, they are wrong in silence.
     """
 
     failed = WORST
@@ -41,6 +45,7 @@ class Measured(Target):
     spread: Mapping[str, float]
     _: KW_ONLY
     extinct: bool = False
+    smooth: bool = False
 
     @property
     def fewest(self) -> int:  # type: ignore[override]
@@ -48,12 +53,14 @@ class Measured(Target):
 
     def __post_init__(self) -> None:
         checks.choice("Measured.extinct", self.extinct, (True, False))
+        checks.choice("Measured.smooth", self.smooth, (True, False))
         if not isinstance(self.functions, Mapping) or not self.functions:
             rule = "a dict of functions by name, such as {'order': tf.measure.nematic_order}"
             raise checks.input_error("Measured.functions", self.functions, rule)
         for name, function in self.functions.items():
             if not isinstance(name, str) or not name.isidentifier():
-                raise checks.input_error("Measured.functions", name, "names, such as 'order'")
+                rule = "names of letters, digits and underscores, such as 'order'"
+                raise checks.input_error("Measured.functions", name, rule)
             if not callable(function):
                 raise checks.input_error(f"Measured.functions[{name!r}]", function, "a function")
         for option in ("wanted", "spread"):
@@ -78,7 +85,7 @@ class Measured(Target):
         return [f"{names} is not a number" if names else "" for names in why]
 
     def why_rough(self, state: tf.State) -> str:
-        return "measures of your own may pass no gradient"
+        return "" if self.smooth else "measures of your own may pass no gradient (smooth=True)"
 
     def _found(self, state: tf.State) -> list[Tensor]:
         """Each measure of each colony, (B,) float64."""
@@ -123,6 +130,11 @@ class Measured(Target):
     @property
     def bounds(self) -> dict[str, str]:
         return {name: _words(low, high) for name, (low, high) in self.wanted.items()}  # type: ignore[misc]
+
+    def misses(self, found: Mapping[str, float]) -> dict[str, float]:
+        ranges = ((n, *self.wanted[n]) for n in self.functions if n in found)  # type: ignore[misc]
+        apart = {n: max(found[n] - high, low - found[n], 0.0) for n, low, high in ranges}
+        return {n: by / self.spread[n] for n, by in apart.items()}
 
     def describe(self) -> str:
         return ", ".join(f"{name} {words}" for name, words in self.bounds.items())

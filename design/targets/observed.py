@@ -270,16 +270,6 @@ class Observed(Target):
         of = lambda values: tuple(values[k] for k in kept)
         return replace(self, values=of(self.values), spread=of(self.spread), plan=plan)
 
-    @property
-    def grown(self) -> Target:
-        """The target of the task in which inference grows its colonies."""
-        return self
-
-    @property
-    def places(self) -> list[int]:
-        """The condition of each statistic, (K,); there is one."""
-        return [0] * len(self.values)
-
     def check(self, state: tf.State) -> None:
         self.plan.check(state)
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
+from design.targets.base import Target
 from design.targets.conditions import Conditions
 from design.targets.observed import Observed
 from design.targets.observed_course import CourseStatistics
@@ -72,15 +73,6 @@ class ObservedConditions(Observed):
         for name, value in found.items():
             object.__setattr__(self, name, value)
 
-    @property
-    def grown(self) -> Conditions:
-        return self.conditions
-
-    @property
-    def places(self) -> list[int]:
-        parts = enumerate(self.conditions.parts)
-        return [k for k, part in parts for _ in cast(Observed, part).values]
-
     def unfit(self, state: tf.State) -> list[str]:
         return self.conditions.unfit(state)
 
@@ -105,6 +97,17 @@ class ObservedConditions(Observed):
 def one_observed(data: object) -> object:
     """Data of several conditions as one; anything else as it is."""
     return ObservedConditions(data) if isinstance(data, Conditions) else data
+
+
+def grown(observed: Observed) -> Target:
+    """The target of the task in which inference grows the colonies of some data."""
+    return observed.conditions if isinstance(observed, ObservedConditions) else observed
+
+
+def places(observed: Observed) -> list[int]:
+    """The condition of each statistic, (K,)."""
+    parts = observed.conditions.parts if isinstance(observed, ObservedConditions) else (observed,)
+    return [k for k, part in enumerate(parts) for _ in cast(Observed, part).values]
 
 
 def _checked(conditions: Conditions) -> tuple[Observed, ...]:

@@ -126,3 +126,52 @@ class Several(Target):
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         self.of_parts(lambda part, own: part.draw(ax, state, place, own), state, history)
+
+
+class SumOfTargets(Several):
+    """The base class of those whose loss is a sum of those of their parts, so that it has residuals
+    where all parts have."""
+
+    def course(self, state: tf.State) -> Tensor | None:
+        """The notes of all parts, how many columns each needs besides, and these."""
+        courses, notes = [p.course(state) for p in self.parts], [p.note(state) for p in self.parts]
+        sizes = [0 if n is None else n.shape[1] for n in notes]
+        more = [None if c is None else c[:, k:] for c, k in zip(courses, sizes, strict=True)]
+        widths = [0 if m is None else m.shape[1] for m in more]
+        found = [n for n in notes if n is not None]
+        if not found:
+            return None
+        told = found[0].new_tensor(widths).expand(state.colonies, -1)
+        return torch.cat([*found, told, *(m for m in more if m is not None)], 1)
+
+    def of_courses(self, state: tf.State, history: Tensor | None) -> list[Tensor] | None:
+        """The residuals of each part; None where one has none. history: as `residuals` gets it."""
+        own = [history] * len(self.parts) if history is None else self._courses(state, history)
+        each = [part.residuals(state, mine) for part, mine in zip(self.parts, own, strict=True)]
+        found = [x for x in each if x is not None]
+        return found if len(found) == len(each) else None
+
+    def _courses(self, state: tf.State, history: Tensor) -> list[Tensor | None]:
+        """What `course` kept of each part, (T, B, k), or what `note` did."""
+        notes = self.of_parts(lambda part, own: own, state, history)
+        first = sum(0 if n is None else n.shape[2] for n in notes)
+        if history.shape[2] == first:
+            return notes
+        told = tf.tangents.both(history[:, :, first : first + len(notes)])[0]
+        # a colony that has ended has no number
+        widths = told.nan_to_num().amax(1).long()
+        begin, widest = first + len(notes), widths.amax(0).tolist()
+        steps = [
+            row[:, begin : begin + sum(own)].split(own, 1)
+            for row, own in zip(history, widths.tolist(), strict=True)
+        ]
+        out: list[Tensor | None] = []
+        for k, note in enumerate(notes):
+            pad = [(0, widest[k] - more[k].shape[1]) for more in steps]
+            more = [torch.nn.functional.pad(m[k], p) for m, p in zip(steps, pad, strict=True)]
+            out.append(None if note is None else torch.cat([note, torch.stack(more)], 2))
+        return out
+
+    @property
+    def squares(self) -> bool:
+        return all(part.squares for part in self.parts)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -25,6 +27,7 @@ from design import (
     infer,
     load_design,
 )
+from design.scoring import finished_colonies
 
 MAKE = [Parameter("strength", 0.1, 30.0, log=True), Parameter("basal", 0.01, 1.0, log=True)]
 
@@ -112,15 +115,84 @@ def test_a_replicate_fails_where_one_of_its_colonies_does():
     assert sorted(found.reasons) == [(0, 0), (0, 1)]
 
 
-def test_slopes_are_differences(tmp_path):
+def smooth(low: float, high: float | None = None) -> Measured:
+    return replace(near(low, high), smooth=True)
+
+
+def test_slopes_are_differences_where_a_measure_may_pass_no_gradient():
     task = Task(gate, MAKE, GATE, cells=8, replicates=2)
     objective = Objective(task)
-    assert objective.why_differences == "it has several conditions"
+    assert "smooth=True" in objective.why_differences
     found = objective.evaluate(np.array([[0.6, 0.4]]), slopes=True)
     assert found.copies == objective.copies(True) == 10
-    h = 1e-4
-    more, less = (objective.evaluate(np.array([[0.6 + x, 0.4]])).loss[0] for x in (h, -h))
-    assert float(found.slopes.gradient[0, 0]) == pytest.approx((more - less) / (2 * h), rel=0.05)
+
+
+@pytest.mark.parametrize("end", [{"cells": 8}, {"until": 2.0}])
+@pytest.mark.parametrize("of_course", [False, True])
+def test_slopes_are_exact_where_those_of_its_targets_are(end, of_course):
+    """The gradient, and twice the product of the residuals' derivatives, as differences give them;
+    also of targets that look at every step."""
+    parts = [smooth(0.0), smooth(3.0)]
+    if of_course:
+        parts = [Lasting(part, since=1.0) for part in parts]
+    target = Conditions([({"iptg": x}, part) for x, part in zip((0.0, 10.0), parts, strict=True)])
+    objective = Objective(Task(gate, MAKE, target, replicates=2, dtype=torch.float64, **end))
+    assert not objective.why_differences
+    points = np.array([[0.6, 0.4], [0.3, 0.7]])
+    found = objective.evaluate(points, slopes=True)
+    assert found.copies == objective.copies(True) == 4
+    plain = objective.evaluate(points)
+    assert found.losses == pytest.approx(plain.losses, rel=1e-9)
+    h = 1e-5
+    for k in range(2):
+        step = h * np.eye(2)[k]
+        more, less = (objective.evaluate(points + x).loss for x in (step, -step))
+        slope = found.slopes.gradient[:, k]
+        assert slope == pytest.approx((more - less) / (2 * h), rel=2e-3, abs=1e-6)
+    if not of_course:  # one residual a colony, the root of its loss
+        each = objective.task
+        roots = []
+        for k in range(2):
+            step = h * np.eye(2)[k]
+            two = (
+                np.concatenate([_levels(each, p) for p in points + x]).reshape(2, -1)
+                for x in (step, -step)
+            )
+            roots.append(np.subtract(*two) / (2 * h) / 0.5)
+        rows = np.stack(roots, 2)  # designs, colonies, parameters
+        wanted = 2 * np.einsum("nci,ncj->nij", rows, rows) / rows.shape[1]
+        assert found.slopes.curvature == pytest.approx(wanted, rel=5e-3, abs=1e-6)
+
+
+def _levels(task: Task, point: np.ndarray) -> list[float]:
+    """The level of each colony of a design, of all replicates under all conditions."""
+    found = finished_colonies(task, task.space.values(point), (0, 1))
+    each = {
+        int(k): float(x)
+        for end in found
+        for k, x in zip(end.state.colony_id, level(end.state), strict=True)
+    }
+    return [each[k] for k in sorted(each)]
+
+
+def test_least_squares_fit_a_dose_response():
+    """Data of four doses without errors: the constants are found again, to digits."""
+    doses = (0.0, 0.5, 2.0, 10.0)
+    *_, end = tf.simulate(gate(strength=2.0, basal=0.3, iptg=torch.tensor(doses)), until=2.0)
+    target = Conditions(
+        [({"iptg": x}, smooth(float(y))) for x, y in zip(doses, level(end), strict=True)]
+    )
+    found = Search(gate, MAKE, target, until=2.0, replicates=1)
+    best = found.run(colonies=400, progress=False)
+    assert "by gradients from the best" in found.why_chosen
+    assert best.loss < 1e-6
+    assert best.values == pytest.approx({"strength": 2.0, "basal": 0.3}, rel=1e-3)
+
+
+def test_a_poor_fit_is_named(tmp_path):
+    target = Conditions([({"iptg": 0.0}, near(50.0)), ({"iptg": 10.0}, near(1.0, 2.0))])
+    best = search(target).run(colonies=12, progress=False)
+    assert "The best design is off most in gfp (iptg = 0) by" in str(best.table())
 
 
 def test_a_study_goes_on_and_a_design_is_saved(tmp_path):

@@ -104,7 +104,10 @@ def test_a_saved_design_asks_for_it_again(tmp_path):
     "made, words",
     [
         (lambda: Measured({}, {}, {}), "a dict of functions by name"),
-        (lambda: Measured({"a b": longest}, {"a b": 1}, {"a b": 1}), "names, such as"),
+        (
+            lambda: Measured({"a b": longest}, {"a b": 1}, {"a b": 1}),
+            "names of letters, digits and underscores, such as",
+        ),
         (lambda: Measured({"a": 3}, {"a": 1}, {"a": 1}), r"functions\['a'\] = 3"),
         (lambda: Measured({"a": longest}, {"b": 1}, {"a": 1}), "wanted .* the names 'a'"),
         (lambda: Measured({"a": longest}, {"a": 1}, 0.1), "spread .* the names 'a'"),

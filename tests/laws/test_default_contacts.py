@@ -162,6 +162,44 @@ def test_case_43_full_chambers_hold_at_any_drag(measured):
     assert measured("worst overlap, µm", max(worst), "≤ 0.1") <= 0.1
 
 
+@pytest.mark.parametrize(
+    "kind, dim, most, until",
+    [
+        ("cocci", 2, 0.11, 8.0), ("rods of two widths", 2, 0.11, 7.5), ("two sizes", 2, 0.3, 8.5),
+        ("cocci", 3, 0.11, 8.5),
+    ],
+)  # fmt: skip
+def test_case_43_a_chamber_full_of_short_cells_stalls(measured, kind, dim, most, until):
+    """Moves of several µm cost less drag there than growth that is taken back. They cannot be
+    carried out, and cells grew into each other, to an area above that of the chamber. Discs fill
+    0.91 of the plane at best. Of two sizes the small ones are pressed into gaps between large
+    ones."""
+    size = {"cocci": (1.1, 1.5), "rods of two widths": (1.8, 2.2), "two sizes": None}[kind]
+    half = 7.0 if dim == 2 else 3.0
+    divides = {0: 1.0, 1: 2.0} if size is None else tf.Uniform(*size)
+    founders = (
+        tf.Cells([[-2.0, 0.0], [2.0, 0.0]], [[1.0, 0.1], [1.0, 0.2]], [0.2, 0.4], [0.4, 0.8],
+                 cell_type=[0, 1])
+        if size is None
+        else tf.Cells([[0.0] * dim], [[1.0, 0.1, 0.05][:dim]], size[0] / 2 - 0.5)
+    )  # fmt: skip
+    walls = [tf.Box((-half,) * dim, (half,) * dim)]
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Division(length=divides), tf.Mechanics(walls, dim=dim),
+        founders=founders,
+    )  # fmt: skip
+    course = list(grown(scene, until=until, seed=0))
+    means = [float(overlap.mean) for _, overlap in course]
+    worst = [float(overlap.worst) for _, overlap in course]
+    state = course[-1][0]
+    area = 2 * state.radius * state.length + math.pi * state.radius**2
+    fill = float((area if dim == 2 else state.volume).sum()) / (2 * half) ** dim
+    low, high = (0.86, 0.92) if dim == 2 else (0.6, 0.75)
+    assert low < measured("share of the chamber that is full", fill, f"{low} to {high}") < high
+    assert measured("mean overlap, µm", max(means), "≤ 0.03") <= 0.03
+    assert measured("worst overlap, µm", max(worst), f"≤ {most}") <= most
+
+
 @pytest.mark.slow
 def test_case_43_a_flat_channel_fills_in_one_pass_a_step(measured):
     """Channels little higher than a cell is wide, in space: repeated passes do not part cells that

@@ -297,11 +297,7 @@ def test_case_20_colonies_of_any_size(device, dtype, measured, contacts, dim):
     assert start.counts.tolist() == [0, 1, 7, 5000]
     state = run(scene, start, 3, 0.2)
     assert int(state.counts[0]) == 0 and bool((state.counts[1:] > start.counts[1:]).any())
-    for value in (
-        state.volume,
-        state.area,
-        *(v for v in vars(state.reports["mechanics"]).values() if v.is_floating_point()),
-    ):
+    for value in (state.volume, state.area, state.reports["mechanics"].residual):
         assert torch.isfinite(value).all()
         measured("values that are not finite", (~torch.isfinite(value)).sum(), "= 0")
     small = run(scene, start.select([0, 1, 2]), 3, 0.2)

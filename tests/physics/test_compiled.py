@@ -82,7 +82,8 @@ def test_both_paths_take_the_same_steps(name):
 
 
 def test_both_paths_take_the_same_late_passes():
-    """60 rods thrown into one another: later passes move more cells, and those less far.
+    """60 rods thrown into one another: later passes move more cells, those less far, and with more
+    drag.
 
     So many passes multiply what rounding leaves by 1e3 or so.
     """
@@ -99,7 +100,7 @@ def test_both_paths_take_the_same_late_passes():
         ends.append(bound.step(bound.start(), 0.05))
     one, other = (end.reports["mechanics"] for end in ends)
     assert int(one.passes) == int(other.passes) > LONG_MOVES + 1
-    assert int(one.clipped) == int(other.clipped) > 0
+    assert int(one.clipped) == int(other.clipped)
     assert float((ends[0].position - ends[1].position).abs().max()) <= 1e-6
 
 

@@ -136,7 +136,7 @@ def test_a_cell_leaves_a_wall_that_it_pulls_hard_enough(backend, strength, holds
         return
     assert height(state, stands=True) == pytest.approx(0.15, rel=1e-3)
     assert tf.measure.wall_forces(state, scene).force.tolist() == [[pytest.approx(-30.0, rel=1e-3)]]
-    assert tf.measure.wall_forces(state, [floor()], 0.01).force.tolist() == [[0.0]]
+    assert tf.measure.wall_forces(state, [floor()]).force.tolist() == [[0.0]]
     # −30 at the end of a cell, over twice its area from above
     pressure = -30.0 * (1.5 + 0.15) / (2 * (2.0 + np.pi / 4))
     assert tf.measure.pressure(state, scene).tolist() == [pytest.approx(pressure, rel=1e-3)]
@@ -179,7 +179,7 @@ def test_compiled_and_torch_agree(dim, parts):
     assert int(ends[0].reports["mechanics"].substeps.max()) == parts
     assert array((ends[0].position - ends[1].position).abs()).max() <= 1e-9
     with_pull, pushes = (
-        float(tf.measure.wall_forces(ends[0], given, 0.01).force) for given in (scene, [floor(dim)])
+        float(tf.measure.wall_forces(ends[0], given).force) for given in (scene, [floor(dim)])
     )
     assert with_pull < pushes - 0.1, "the wall holds some of them"
 

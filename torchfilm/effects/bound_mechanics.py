@@ -13,7 +13,6 @@ from torch import Tensor
 
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.mechanics_report import MechanicsReport
-from torchfilm.kernels.scheme import MARGIN
 from torchfilm.physics import capsule, compiled, torch_step
 from torchfilm.physics.adhesion import Bonds, holds_of, levels_of, most_of_limits
 from torchfilm.physics.contacts import Capsules
@@ -160,10 +159,8 @@ class BoundMechanics(BoundEffect):
     ) -> MechanicsReport:
         """The report, in which colonies fail that have a cell too long for their space. length:
         (N,) after growth."""
-        kinds, radius = self.effect.adhesion, state.radius.detach().double()
-        mean = state.groups.sum(radius) / state.counts.clamp(min=1)
-        reach = MARGIN * mean.index_select(0, state.colony)
-        reach = reach + max((kind.reach for kind in kinds if kind.to == "cells"), default=0.0)
+        radius = state.radius.detach().double()
+        reach = self.effect.contact_reach(state)
         too_long = space.too_long(length.to(radius.device), radius, reach)
         failed = state.groups.any(too_long).to(report.status.device)
         return replace(report, status=torch.where(failed, TOO_LONG, report.status))
@@ -193,7 +190,7 @@ class BoundMechanics(BoundEffect):
             fields["elongation"] = found.elongation
         if found.contact_alpha is not None and found.compression is not None:
             fields |= {"contact_alpha": found.contact_alpha, "compression": found.compression}
-        report = MechanicsReport(**vars(found.report), substeps=found.substeps)
+        report = MechanicsReport(**vars(found.report), substeps=found.substeps, dt=dt)
         if given.bonds is not None:
             report = self._stuck(report, state, given.bonds.levels, dt)
         position = found.position
@@ -235,7 +232,7 @@ class BoundMechanics(BoundEffect):
             found, new["compression"] = of_contacts
             given = self._given_alpha(state, dt, substeps)
             new["contact_alpha"] = found if given is None else given
-        of_step = MechanicsReport(**vars(report), substeps=substeps)
+        of_step = MechanicsReport(**vars(report), substeps=substeps, dt=dt)
         if self.effect.adhesion:
             assert bonds is not None
             of_step = self._stuck(of_step, state, torch.from_numpy(bonds[0]), dt)

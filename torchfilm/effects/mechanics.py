@@ -10,12 +10,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
+from torch import Tensor
 
 from torchfilm.effect import MECHANICS, Binding, BoundEffect, Effect
 from torchfilm.effects.bound_mechanics import BoundMechanics
 from torchfilm.effects.mechanics_words import numerics_in_words
 from torchfilm.kernels.bilateral_scheme import CLOSE, PENALTY, TOLERANCE
-from torchfilm.kernels.scheme import OVERLAP, PASSES
+from torchfilm.kernels.scheme import MARGIN, OVERLAP, PASSES
 from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
 from torchfilm.parameters import number_range
 from torchfilm.physics.adhesion import Adhesion, check_walls_of
@@ -70,7 +71,7 @@ class Mechanics(Effect):
     if contacts are one-sided, those near them (default 0.2 radii, 24 passes, 1 for soft cells;
     bilateral: 0.2 radii or less, 1 pass in the plane and 2 in space, 6 with sub-steps). tolerance:
     of a solve. One-sided: relative error of the contact forces, default 0.07. Bilateral: worst
-    residual relative to that at rest, default 0.05 or, where α γ is below 0.1, 0.05 · (α γ/0.1)^¼.
+    residual relative to that at rest, default 0.005; where α γ is below 0.1, times (α γ/0.1)^¼.
     max_iterations: CG iterations a solve. max_elongation: µm; a colony whose cells would grow more
     in a step takes sub-steps. adhesion: cells stick together, see `tf.Adhesion`; several kinds add
     up. Only one-sided contacts have it. backend: "compiled" kernels, on the CPU, or "torch".
@@ -256,13 +257,20 @@ class Mechanics(Effect):
     def writes(self) -> tuple[str, ...]:
         return ("position", "axis", "length", "elongation", *self._own_fields)
 
+    def contact_reach(self, state: State) -> Tensor:
+        """How near others are that a cell meets in a step, by contacts and bonds, (N,) µm."""
+        mean = state.groups.sum(state.radius.detach().double()) / state.counts.clamp(min=1)
+        bonds = (kind.reach for kind in self.adhesion if kind.to == "cells")
+        return MARGIN * mean.index_select(0, state.colony) + max(bonds, default=0.0)
+
     def check(self, state: State, values: Values) -> None:
         if state.dim != self.dim:
             raise checks.input_error("Mechanics.dim", self.dim, f"{state.dim}, like the cells")
         if (space := self.periodic_space) is not None:
             check_first_cells(
-                space, state.position, state.length, state.radius, state.own_colony_id, state.uid
-            )
+                space, state.position, state.length, state.radius, self.contact_reach(state),
+                state.own_colony_id, state.uid,
+            )  # fmt: skip
         for kind in self.adhesion:
             check_variables("Adhesion", state, adhesin=kind.adhesin, partner=kind.partner)
         for surface in self.surfaces():

@@ -32,17 +32,18 @@ HINTS = {
     BAD_LENGTH: "Check what sets the lengths: a state that was changed, or an effect of your own",
     BAD_DRAG: "Check the effect or rule that sets the field drag",
     COLLAPSED: (
-        "Take a smaller dt; leave alpha out, or take a smaller one where contacts give way too"
-        " much; or start from cells that do not overlap"
+        "Take a smaller dt or length_drag; leave alpha out, or take a smaller one where contacts"
+        " give way too much; or start from cells that do not overlap"
     ),
 }
 
 
 @dataclass(frozen=True)
 class MechanicsReport(ContactReport):
-    """As `ContactReport`, with the `substeps` taken in each colony, (B,)."""
+    """As `ContactReport`, with the `substeps` taken in each colony, (B,), and the step, `dt` h."""
 
     substeps: Tensor
+    dt: float
 
     @property
     def hint(self) -> str:

@@ -193,7 +193,7 @@ def step_colony(memory, x, axis, base, growth, radius, viscosity, length_drag, a
         give_back(memory, top)
         again = number > 0
         hold, half = again and not soft, 0.5 * length
-        drags(length, radius, viscosity, length_drag, grows, scale, dof)
+        drags(length, radius, viscosity, length_drag, grows, 1.0, scale, dof)
         found = _contacts(memory, x, axis, half, radius, hold, dof)
         if again:
             for i in range(n):

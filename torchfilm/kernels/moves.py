@@ -16,14 +16,16 @@ MOVE, AT, WAY = range(3)
 
 
 @lean
-def drags(length, radius, viscosity, length_drag, growth, scale, dof):
-    """M^(−½) of each cell, (n, D). A cell that does not grow is rigid: its length cannot move."""
+def drags(length, radius, viscosity, length_drag, growth, slower, scale, dof):
+    """M^(−½) of each cell, (n, D). A cell that does not grow is rigid: its length cannot move.
+    slower: by this factor cells move and turn less easily."""
     D = degrees(dof)
     d = 2 if D == 4 else 3
     for i in range(length.shape[0]):
         whole = length[i] + 2 * radius[i]
-        across = 1.0 / math.sqrt(viscosity[i] * whole)
-        turn = 1.0 / math.sqrt(viscosity[i] * whole * whole * whole / 12.0)
+        drag = slower * viscosity[i] * whole
+        across = 1.0 / math.sqrt(drag)
+        turn = 1.0 / math.sqrt(drag * whole * whole / 12.0)
         for k in range(D - 1):
             scale[i, k] = across if k < d else turn
         scale[i, D - 1] = 1.0 / math.sqrt(length_drag[i]) if growth[i] > 0 else 0.0

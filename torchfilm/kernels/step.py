@@ -63,6 +63,8 @@ from torchfilm.kernels.scheme import (
     PEAKED,
     SHORTER,
     SHRINK,
+    SLOWER,
+    SLOWEST,
     SOFTER,
     SOFTEST,
     TOO_DEEP,
@@ -180,15 +182,17 @@ def _arrays(memory, length, growth, shortest, last, roots):
 
 
 @lean
-def _prepared(memory, x, axis, growth, radius, drag, last, first_pass, rising, hardness, softer,
-              walls, alphas, reached, margin, found, arrays, dof):  # fmt: skip
+def _prepared(memory, x, axis, growth, radius, drag, last, number, rising, hardness, softer,
+              walls, alphas, reached, margin, limits, found, arrays, dof):  # fmt: skip
     """Puts what a pass starts from into its arrays. Returns rows of cells at walls, with room for
     those of `found`, how many there are, and the deepest gap."""
     length, least, half, (reach, root), (alpha, low), scale, y, _, _ = arrays
-    drags(length, radius, drag[0], drag[1], growth, scale, dof)
-    _put_start(y, last, scale, first_pass, rising)
+    most = max(SLOWEST * limits[0] / (hardness * softer), 1.0)
+    slower = min(SLOWER ** max(number - LONG_MOVES, 0), most)
+    drags(length, radius, drag[0], drag[1], growth, slower, scale, dof)
+    _put_start(y, last, scale, number == 0, rising)
     _numbers(
-        x, length, scale, growth, least, last, first_pass, hardness, softer, walls[4], walls[3],
+        x, length, scale, growth, least, last, number == 0, hardness, softer, walls[4], walls[3],
         alphas, margin, alpha, low, reach, root, dof,
     )  # fmt: skip
     at = walls, root, reach
@@ -216,8 +220,8 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
     while number < passes:
         give_back(memory, top)  # the contacts are kept, not what was made of them
         rows, at_walls, deepest = _prepared(
-            memory, x, axis, growth, radius, drag, last, number == 0, rising, hardness[0], softer,
-            walls, alphas, reach, margin + reach[1], found, arrays, dof,
+            memory, x, axis, growth, radius, drag, last, number, rising, hardness[0], softer,
+            walls, alphas, reach, margin + reach[1], limits, found, arrays, dof,
         )  # fmt: skip
         if number > 0 and not deeply:  # cells do not lie deep in others; but in a wall?
             if deepest >= -deep:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -22,6 +22,8 @@ from torchfilm.kernels.scheme import (
     PEAKED,
     SHORTER,
     SHRINK,
+    SLOWER,
+    SLOWEST,
     SOFTER,
     SOFTEST,
     TOO_DEEP,
@@ -33,7 +35,7 @@ from torchfilm.physics.adjoint import attach_gradient
 from torchfilm.physics.contacts import CandidateContacts, Capsules
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.near_rows import near_rows
-from torchfilm.physics.one_sided_solve import Minimum, minimise
+from torchfilm.physics.one_sided_solve import Minimum, Solved, minimise
 from torchfilm.physics.problem import CONVERGED, ITERATION_LIMIT, NOT_FINITE, ContactProblem
 from torchfilm.physics.solve import warn_if_loose
 from torchfilm.physics.space import near_pairs
@@ -228,7 +230,7 @@ class _OneStep:
             now = Capsules(at.position.T, at.axis.double().T, half, given.radius)
             contacts = with_bonds(contacts, given.bonds, now)
             walls = with_wall_bonds(walls, given.bonds, now)
-        solved = self._solved(at, contacts, walls, moving, cells, active, least, first_pass)
+        solved = self._solved(at, contacts, walls, moving, cells, active, least, number)
         part, end = solved.problem, solved.end
         y = self._with_gradient(part, end)
         move = torch.zeros_like(at.move).index_copy(0, cells, y * part.scale)
@@ -255,10 +257,10 @@ class _OneStep:
         moving = moving & self.of_cells(sound).bool()
         return self._moved(at, move, about, moving, least, number)
 
-    def _solved(self, at, contacts, walls, moving, cells, active, least, first_pass) -> _Solved:
+    def _solved(self, at, contacts, walls, moving, cells, active, least, number) -> Solved:
         """Solve for the moving cells: with softer contacts where a solve does not converge, then
         harder again; and in a first pass again where the force has grown much."""
-        given, settings = self.given, self.given.settings
+        given, settings, first_pass = self.given, self.given.settings, number == 0
         hardness, softer = at.hardness, torch.ones_like(at.hardness)
         follows = first_pass and given.alpha is None
         spent, fell = torch.zeros_like(at.iterations), torch.zeros_like(active)
@@ -266,10 +268,10 @@ class _OneStep:
         end: Minimum | None = None
         kept: Minimum | None = None
         while True:
-            part = self._problem(at, contacts, walls, hardness * softer, softer, least, first_pass)
+            part = self._problem(at, contacts, walls, hardness * softer, softer, least, number)
             part = part if cells.numel() == moving.numel() else part.among(moving, cells)
             if end is not None and not goes_on:
-                return _Solved(part, end, hardness * softer, spent, fell)
+                return Solved(part, end, hardness * softer, spent, fell)
             start = torch.zeros_like(part.scale)
             if first_pass:
                 scale = part.scale.detach()
@@ -300,7 +302,7 @@ class _OneStep:
             again = up | down | lags
             goes_on, some_lag, falls_back = numbers(again.any(), lags.any(), falls.any())
             if not (goes_on or falls_back):
-                return _Solved(part, end, used, spent, fell)
+                return Solved(part, end, used, spent, fell)
             if follows and some_lag:
                 y = self._with_gradient(part, end)
                 after = part.gap_after(y) if y.requires_grad else end.after
@@ -322,7 +324,7 @@ class _OneStep:
             part, end, tolerance, settings.max_iterations, ids, settings.compiled
         )
 
-    def _problem(self, at, contacts, walls, hardness, softer, least, first_pass) -> ContactProblem:
+    def _problem(self, at, contacts, walls, hardness, softer, least, number) -> ContactProblem:
         """The linear problem of one pass: α by colony, or the given one times `softer`, (B,)."""
         given, settings = self.given, self.given.settings
         alpha = self.of_cells(hardness)
@@ -333,6 +335,10 @@ class _OneStep:
         across, turning, _ = capsule.drag(at.length, given.radius, given.viscosity)
         turns = settings.degrees - settings.dim - 1
         length_drag = torch.where(rigid, torch.inf, given.length_drag)
+        if number > LONG_MOVES:
+            most = (SLOWEST * self.softest / hardness).clamp(min=1.0)
+            slower = self.of_cells(most.clamp(max=SLOWER ** (number - LONG_MOVES)))
+            across, turning = slower * across, slower * turning
         drag = [across] * settings.dim + [turning] * turns + [length_drag]
         scale = torch.stack(drag, 1).rsqrt()
         root, pulls = roots_of(contacts, alpha)
@@ -349,7 +355,7 @@ class _OneStep:
         )
         gap = torch.cat([contacts.gap * root.squeeze(1), walls.gap * wall_root]).to(dtype)
         soft = torch.cat([pulls, soft])
-        applied = torch.zeros_like(gap) if first_pass else torch.where(soft, gap.clamp(max=0), 0.0)
+        applied = torch.where(soft, gap.clamp(max=0), 0.0) if number > 0 else torch.zeros_like(gap)
         low = torch.where(
             rigid, 0.0, (least - at.length) * length_drag.sqrt().nan_to_num(posinf=0.0)
         ).clamp(max=0.0)
@@ -427,14 +433,3 @@ class _OneStep:
             cut = cut if weight is None else torch.where(weight >= 1, cut, 1.0)
             share = torch.minimum(share, cut)
         return share
-
-
-@dataclass(frozen=True)
-class _Solved:
-    """A solve of a pass; by colony α, all iterations, and where only softer contacts converged."""
-
-    problem: ContactProblem
-    end: Minimum
-    hardness: Tensor
-    spent: Tensor
-    fell: Tensor

@@ -265,3 +265,14 @@ class _LineSearch:
         y = torch.where(mine.unsqueeze(1), y, here.y)
         after = here.after - share.index_select(0, row_owner) * self.change
         return _Point(y, after, alone, fall, stuck)
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A solve of a pass; by colony α, all iterations, and where only softer contacts converged."""
+
+    problem: ContactProblem
+    end: Minimum
+    hardness: Tensor
+    spent: Tensor
+    fell: Tensor

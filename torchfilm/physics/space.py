@@ -230,10 +230,12 @@ def check_walls_in(space: PeriodicSpace, surfaces: Sequence[Surface]) -> None:
 
 
 def check_first_cells(
-    space: PeriodicSpace, position: Tensor, length: Tensor, radius: Tensor, ids: Tensor, uid: Tensor
-) -> None:
+    space: PeriodicSpace, position: Tensor, length: Tensor, radius: Tensor, reach: Tensor,
+    ids: Tensor, uid: Tensor,
+) -> None:  # fmt: skip
     """Raise InputError for a cell that starts beyond a face, or is too long. position (N, d);
-    length, radius (N,) µm; ids, uid: (N,) of the cells' colonies, and of the cells."""
+    length, radius, and reach of contacts, (N,) µm; ids, uid: (N,) of the cells' colonies, and of
+    the cells."""
     name = lambda k: f"cell {int(uid[k])} of colony {int(ids[k])}"
     beyond = torch.nonzero(space.outside(position)).squeeze(1)
     if beyond.numel():
@@ -243,11 +245,12 @@ def check_first_cells(
             f"Mechanics.periodic: {name(k)} starts at {at}, beyond the faces ({space.told}; cells"
             f" beyond them: {beyond.numel()}). Move the cell, or the faces."
         )
-    long = torch.nonzero(space.too_long(length, radius, 0.0)).squeeze(1)
+    long = torch.nonzero(space.too_long(length, radius, reach)).squeeze(1)
     if long.numel():
         k = int(long[0])
         raise checks.InputError(
             f"Mechanics.periodic: {name(k)} is {float(length[k] + 2 * radius[k]):.3g} µm long with"
-            f" its caps, more than half of the way between the faces ({space.told}): it could meet"
-            " two images of another cell. Place the faces farther apart."
+            f" its caps, and its contacts reach {float(reach[k]):.3g} µm, in all more than half of"
+            f" the way between the faces ({space.told}): it could meet two images of another cell."
+            " Place the faces farther apart."
         )
