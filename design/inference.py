@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -90,7 +91,10 @@ def infer(
     found = _simulate(task, known, simulations, kept, executor, progress)
     with open_bar(flows, progress, "infer", counted="flows") as bar:
         estimator = _learn(found, seed, flows, epochs, bar)
-    return Posterior.of(task, known, found, estimator, data, samples)
+    posterior = Posterior.of(task, known, found, estimator, data, samples)
+    if posterior.other_sizes:
+        warnings.warn(posterior.other_sizes, stacklevel=3)
+    return posterior
 
 
 def _checked_data(observed: Any) -> Observed:

@@ -18,7 +18,8 @@ from design.prior import Prior
 from design.simulations import Simulations, random_points, shown_values, simulate_points
 from design.targets.conditions import Conditions
 from design.targets.observed import Observed
-from design.targets.observed_conditions import one_observed
+from design.targets.observed_conditions import cells_each, one_observed
+from design.targets.statistics import LOG_CELLS
 from design.task import Task
 from torchfilm import checks
 
@@ -27,6 +28,7 @@ BEYOND = 0.002  # share of simulations beyond a statistic for which the model is
 STREAM = 2  # of the truths of a calibration
 PREDICTED = 3  # of predictions
 DRAWN, PRIOR_DRAWN = 4, 20_000  # of points of the prior in a picture, and how many
+ALIKE = 1.5  # numbers of cells that differ by less than this factor make about the same intervals
 TOGETHER = 0.9  # a correlation from which the table tells of it
 
 
@@ -136,6 +138,25 @@ class Posterior:
                 )
         return out
 
+    @property
+    def other_sizes(self) -> str:
+        """Whether simulated colonies have far more or fewer cells than those that were observed,
+        where the number of cells is not compared; else ""."""
+        names, cells = self.observed.plan.names, self.simulations.cells[self.simulations.sound]
+        compared = any(name.startswith(LOG_CELLS) for name in names)
+        seen, counts = cells_each(self.observed), cells[np.isfinite(cells)]
+        if compared or not seen or not len(counts):
+            return ""
+        found = float(np.median(counts))
+        if 1 / ALIKE <= found / seen <= ALIKE:
+            return ""
+        return (
+            f"{found:.0f} cells of each simulated colony were seen, and {seen:.0f} of each observed"
+            " one: the intervals are those of data of as many cells as were simulated, too"
+            f" {'narrow' if found > seen else 'wide'}. Simulate as many as were observed (founders,"
+            " until), or observe as many."
+        )
+
     def table(self, level: float = LEVEL) -> str:
         """The parameters with their means and intervals, failures, and what no simulation
         reaches."""
@@ -160,6 +181,8 @@ class Posterior:
             for (one, other), r in self.correlations.items()
             if abs(r) >= TOGETHER
         ]
+        if self.other_sizes:
+            lines.append(self.other_sizes)
         if self.surprises:
             lines.append("The model does not reach the data within these bounds:")
             lines += [f"  {words}" for words in self.surprises]
@@ -191,16 +214,16 @@ class Posterior:
         checks.integer("samples", samples, least=9)
         points = random_points(self.task, self.prior, truths, stream=STREAM)
         found = simulate_points(self.task, points, _first(STREAM))
-        kept = Simulations(points[found.sound], found.statistics[found.sound])
-        drawn = self.estimator.sample(kept.statistics, samples, seed=self.task.seed + 1)
-        here = self.estimator.log_density(kept.points[:, None], kept.statistics)
-        there = self.estimator.log_density(drawn, kept.statistics)
+        hidden, seen = points[found.sound], found.statistics[found.sound]
+        drawn = self.estimator.sample(seen, samples, seed=self.task.seed + 1)
+        here = self.estimator.log_density(hidden[:, None], seen)
+        there = self.estimator.log_density(drawn, seen)
         return Calibration(
             names=self.names,
-            ranks=(drawn < kept.points[:, None]).sum(1),
+            ranks=(drawn < hidden[:, None]).sum(1),
             density_ranks=(there > here).sum(1),
             samples=samples,
-            failed=truths - len(kept),
+            failed=truths - len(hidden),
         )
 
     def predict(self, count: int = 100) -> Prediction:

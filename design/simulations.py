@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -38,11 +39,13 @@ class Simulations:
     """Statistics of colonies of random parameters.
 
     points: coordinates of the parameters, (n, D) in [0, 1]; statistics: (n, K), means
-    over the colonies of each, NaN where one of them failed. reasons: of failures, by row.
+    over the colonies of each, NaN where one of them failed. cells: (n,) of each, the mean of its
+    colonies. reasons: of failures, by row.
     """
 
     points: np.ndarray
     statistics: np.ndarray
+    cells: np.ndarray
     reasons: dict[int, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -57,13 +60,14 @@ class Simulations:
         """Some of them, from the first on."""
         start, stop, _ = rows.indices(len(self))
         reasons = {k - start: words for k, words in self.reasons.items() if start <= k < stop}
-        return Simulations(self.points[rows], self.statistics[rows], reasons)
+        return Simulations(self.points[rows], self.statistics[rows], self.cells[rows], reasons)
 
     def followed_by(self, other: Simulations) -> Simulations:
         moved = {k + len(self): words for k, words in other.reasons.items()}
         return Simulations(
             np.concatenate([self.points, other.points]),
             np.concatenate([self.statistics, other.statistics]),
+            np.concatenate([self.cells, other.cells]),
             self.reasons | moved,
         )
 
@@ -129,28 +133,31 @@ def simulate_points(task: Task, points: np.ndarray, first: int) -> Simulations:
     random numbers it follows."""
     values = [task.space.values(point) for point in points]
     statistics = np.full((len(points), len(observed_of(task).values)), np.nan)
-    reasons: dict[int, str] = {}
+    cells, reasons = np.full(len(points), np.nan), {}
     for item in cut_work_items(task, values, task.replicates, 1.0, 1):
-        for row, found, why in _run_item(task, item, first):
-            statistics[row] = found
+        for row, found, count, why in _run_item(task, item, first):
+            statistics[row], cells[row] = found, count
             if why:
                 reasons[row] = why
-    return Simulations(points, statistics, reasons)
+    return Simulations(points, statistics, cells, reasons)
 
 
 def _simulate_part(task: Task, part: tuple[int, np.ndarray]) -> Simulations:
     return simulate_points(task, part[1], part[0])
 
 
-def _run_item(task: Task, item: WorkItem, first: int) -> Iterator[tuple[int, np.ndarray, str]]:
-    """Row, statistics (K,) and reason of failure of each design of a work item. A scene that is
-    refused is tried in halves, so that only the designs at fault fail."""
+def _run_item(
+    task: Task, item: WorkItem, first: int
+) -> Iterator[tuple[int, np.ndarray, float, str]]:
+    """Row, statistics (K,), cells and reason of failure of each design of a work item. A scene that
+    is refused is tried in halves, so that only the designs at fault fail."""
     try:
         yield from _grow_item(task, item, first)
         return
     except (tf.InputError, tf.SimulationError) as error:
         if len(item.rows) == 1:
-            yield item.rows[0], np.full(len(observed_of(task).values), np.nan), str(error)
+            nothing = np.full(len(observed_of(task).values), np.nan)
+            yield item.rows[0], nothing, math.nan, str(error)
             return
     half = len(item.rows) // 2
     for part in (range(half), range(half, len(item.rows))):
@@ -159,12 +166,13 @@ def _run_item(task: Task, item: WorkItem, first: int) -> Iterator[tuple[int, np.
 
 @tf.one_torch_thread()
 @torch.no_grad()
-def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.ndarray, str]]:
+def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.ndarray, float, str]]:
     observed, each = observed_of(task), task.replicates * task.conditions
     streams = [(first + row) * each + k for row in item.rows for k in range(each)]
     scene = task.family.scene(item.values, repeat=task.replicates)
     prepared = colonies.prepare(scene, streams, task.settings)
     found = np.full((len(streams), len(observed.values)), np.nan)
+    counts = np.full(len(streams), np.nan)
     reasons: dict[int, str] = {}
     cells, until = task.end(1.0)
     for event in grow(prepared, cells=cells, until=until, note=observed.note):
@@ -173,6 +181,7 @@ def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.nda
             continue
         ids = event.state.colony_id.cpu().numpy()
         found[ids] = observed.statistics(event.state, event.history).cpu().numpy()
+        counts[ids] = event.state.counts.cpu().numpy()
         for colony_id, why in zip(ids.tolist(), observed.unfit(event.state), strict=True):
             if why:  # it has stopped before the data were observed
                 found[colony_id] = np.nan
@@ -183,7 +192,8 @@ def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.nda
     means = found.reshape(shape)[:, :, places(observed), columns].mean(1)
     for k in np.flatnonzero(~np.isfinite(means).all(1)).tolist():
         reasons.setdefault(k, "a statistic is not finite")
-    return [(row, means[k], reasons.get(k, "")) for k, row in enumerate(item.rows)]
+    size = counts.reshape(len(item.rows), each).mean(1).tolist()
+    return [(row, means[k], size[k], reasons.get(k, "")) for k, row in enumerate(item.rows)]
 
 
 def random_points(task: Task, prior: Prior, count: int, *, stream: int) -> np.ndarray:
@@ -207,6 +217,7 @@ def _write(
     kept = "earlier simulations"
     with replacing(path, FORMAT, VERSION, about(task, prior), kept, before) as file:
         file["points"], file["statistics"] = known.points, known.statistics
+        file["cells"] = known.cells
         names = list(observed_of(task).plan.names)
         file.create_dataset("names", data=names, dtype=h5py.string_dtype())
         for name, column in shown_values(task, known.points).items():
@@ -221,11 +232,14 @@ def _read(path: Path | None, task: Task, prior: Prior) -> Simulations:
     task and for one that cannot be read."""
     names = observed_of(task).plan.names
     if path is None or not path.exists():
-        return Simulations(np.empty((0, task.space.size)), np.empty((0, len(names))))
+        return Simulations(np.empty((0, task.space.size)), np.empty((0, len(names))), np.empty(0))
     with reading(path, FORMAT, VERSION, "file of simulations") as file:
         kept, mine = json.loads(file.attrs["about"]), about(task, prior)
         reasons = {int(k): words for k, words in json.loads(file.attrs["reasons"]).items()}
-        found = Simulations(file["points"][...], file["statistics"][...], reasons)
+        points, cells = file["points"][...], np.full(len(file["points"]), np.nan)
+        if "cells" in file:  # older files have none
+            cells = file["cells"][...]
+        found = Simulations(points, file["statistics"][...], cells, reasons)
         kept["statistics"] = [n.decode() for n in file["names"][...]]
     mine["statistics"] = list(names)
     plain = json.loads(json.dumps(mine))

@@ -12,7 +12,7 @@ import torchfilm as tf
 from design.targets.base import Target
 from design.targets.conditions import Conditions
 from design.targets.observed import Observed
-from design.targets.observed_course import CourseStatistics
+from design.targets.observed_course import CourseStatistics, ObservedCourse
 from design.targets.statistics import ColonyStatistics
 from torchfilm import checks
 
@@ -102,6 +102,15 @@ def one_observed(data: object) -> object:
 def grown(observed: Observed) -> Target:
     """The target of the task in which inference grows the colonies of some data."""
     return observed.conditions if isinstance(observed, ObservedConditions) else observed
+
+
+def cells_each(observed: Observed) -> float:
+    """How many cells of a colony were observed at the end, on average; 0 where none are known."""
+    if isinstance(observed, ObservedConditions):
+        parts = [cells_each(cast(Observed, part)) for part in observed.conditions.parts]
+        return sum(parts) / len(parts)
+    last = observed.frames[-1] if isinstance(observed, ObservedCourse) else observed
+    return last.cells / last.colonies
 
 
 def places(observed: Observed) -> list[int]:

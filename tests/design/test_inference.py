@@ -70,7 +70,7 @@ def test_simulations_resume(data, tmp_path, monkeypatch):
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
         assert alike(simulate_designs(task, 10, executor=pool), whole)
     with h5py.File(path) as file:
-        assert set(file) == {"points", "statistics", "names", "values"}
+        assert set(file) == {"points", "statistics", "cells", "names", "values"}
         assert file["values/rate"][0] == pytest.approx(task.space.values(whole.points[0])["rate"])
 
 
@@ -387,3 +387,33 @@ def test_parameters_that_the_data_do_not_tell_apart_are_named(data):
     assert "first and second are not told apart: their correlation is -" in tied.table()
     loose = replace(found, points=rng.random((50, 2)))
     assert "told apart" not in loose.table()
+
+
+def populated(mean=20.0, cells=60):
+    """Cells of a drawn level, none of which divides."""
+    level = tf.LogNormal(mean, 0.3)
+    place = np.stack([6.0 * np.arange(cells), np.zeros(cells)], 1)
+    founders = tf.Cells(place, np.tile([[1.0, 0.0]], (cells, 1)))
+    circuit = tf.Circuit(relaxing, species="gfp", level=level)
+    return tf.Scene(circuit, founders=founders, dim=2, dt=0.5)
+
+
+def relaxing(u, s, p, cell):
+    return {"gfp": 20.0 * (p.level - u.gfp)}
+
+
+@needs_sbi
+@pytest.mark.parametrize("observed, words", [(12, "too narrow"), (50, ""), (300, "too wide")])
+def test_other_numbers_of_cells_than_were_observed_are_named(observed, words):
+    """Data of a flow cytometer: the levels of some cells of a large population."""
+    levels = 20.0 * np.exp(0.3 * np.random.default_rng(1).normal(size=observed))
+    table = Observed.from_table({"gfp": levels}, species=("gfp",), time=1.0)
+    given = {"simulations": 60, "flows": 1, "epochs": 5, "samples": 20, "progress": False}
+    mean = [Parameter("mean", 10.0, 40.0, log=True)]
+    fit = lambda: infer(populated, mean, table.without("cells"), **given)
+    if not words:
+        assert fit().other_sizes == ""
+        return
+    with pytest.warns(UserWarning, match=f"60 cells of each simulated.* {observed} of.* {words}"):
+        found = fit()
+    assert words in found.table()
