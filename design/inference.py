@@ -18,6 +18,7 @@ from design.prior import Prior
 from design.progress import advance, open_bar
 from design.simulations import Simulations, simulate_designs
 from design.targets.conditions import Conditions
+from design.targets.measured import Measured
 from design.targets.observed import Observed
 from design.targets.observed_conditions import grown, one_observed
 from design.task import Task
@@ -30,7 +31,7 @@ LEAST = 50  # simulations that succeeded
 def infer(
     scene: Callable[..., tf.Scene] | str,
     parameters: Sequence[Parameter | Choice],
-    observed: Observed | Conditions,
+    observed: Observed | Measured | Conditions,
     *,
     simulations: int = 5000,
     cells: int | None = None,
@@ -59,8 +60,9 @@ def infer(
     observed, whose statistics are averaged. From these, neural posterior estimation
     (`NeuralPosterior` names the sources) learns the density of the parameters, given statistics.
     Simulations that fail are left out, so the posterior is that of colonies that do not.
-    observed: the data, or `Conditions` of the data of each condition, such as a dose response: each
-    replicate is then a colony under each condition, with random numbers of its own.
+    observed: the data; or measures of your own, `Measured`, whose spreads are the standard errors
+    of the wanted values; or `Conditions` of the data of each condition, such as a dose response:
+    each replicate is then a colony under each condition, with random numbers of its own.
 
     scene, parameters, cells, fixed, seed, dt, dtype, device: as for `Search`. until: h, by default
     when the data were observed. replicates: with fewer than were observed, the posterior is wider
@@ -106,7 +108,7 @@ def _checked_data(observed: Any) -> Observed:
         )
     data = one_observed(observed)
     if not isinstance(data, Observed):
-        rule = "an Observed, such as Observed.from_table(…), or Conditions of them"
+        rule = "an Observed, such as Observed.from_table(…), a Measured, or Conditions of these"
         raise checks.input_error("observed", observed, rule)
     return data
 

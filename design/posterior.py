@@ -17,6 +17,7 @@ from design.prediction import Prediction
 from design.prior import Prior
 from design.simulations import Simulations, random_points, shown_values, simulate_points
 from design.targets.conditions import Conditions
+from design.targets.measured import Measured
 from design.targets.observed import Observed
 from design.targets.observed_conditions import cells_each, one_observed
 from design.targets.statistics import LOG_CELLS
@@ -63,7 +64,7 @@ class Posterior:
         points = estimator.sample(row, samples, seed=task.seed)[0]
         return Posterior(task, prior, simulations, estimator, observed, points)
 
-    def given(self, observed: Observed | Conditions) -> Posterior:
+    def given(self, observed: Observed | Measured | Conditions) -> Posterior:
         """The posterior for other data of the same statistics (`Observed.from_table(…, like=…)`)
         and as many colonies, without further simulations."""
         data = cast(Observed, one_observed(observed))

@@ -26,11 +26,12 @@ from design.parameters import Value
 from design.prior import Prior
 from design.scoring import WorkItem, cut_work_items
 from design.targets.observed import Observed
-from design.targets.observed_conditions import one_observed, places
+from design.targets.observed_conditions import errors, one_observed, places
 from design.task import Task
 from torchfilm import checks
 
 FORMAT, VERSION = "torchfilm simulations", 1
+NOISE = 5  # of the stream of random numbers that errors of measurement follow
 BATCH = 256  # designs that are grown at once, and after which the file is written
 
 
@@ -139,6 +140,10 @@ def simulate_points(task: Task, points: np.ndarray, first: int) -> Simulations:
             statistics[row], cells[row] = found, count
             if why:
                 reasons[row] = why
+    noise = np.array(errors(observed_of(task)))
+    if noise.any():  # data are measured with errors; each simulation has its own
+        draws = (np.random.default_rng([task.seed, NOISE, first + k]) for k in range(len(points)))
+        statistics = statistics + noise * np.array([d.normal(size=len(noise)) for d in draws])
     return Simulations(points, statistics, cells, reasons)
 
 

@@ -27,7 +27,7 @@ from design.scene_family import (
 )
 from design.targets.base import Target
 from design.targets.goals import Goals, of_seeds
-from design.targets.observed import Observed
+from design.targets.several import observed_at
 from torchfilm import checks
 
 NONE = cast(Target, None)  # the target where `targets` are given
@@ -91,6 +91,9 @@ class Task(TaskOptions):
     def __post_init__(self) -> None:
         self._set(target=_one_target(self.target, self.targets), targets=None)
         checks.device(self.device)
+        own = observed_at(self.target)
+        if self.until is None and self.cells is None:
+            self._set(until=own)
         until = _check_options(self)
         function, fixed = scene_function(self.scene), dict(self.fixed or {})
         space, conditions = Space(self.parameters), self.target.arguments
@@ -116,12 +119,14 @@ class Task(TaskOptions):
         dt = tried.dt if self.dt is None else checks.number("dt", self.dt, above=0.0)
         if until is not None and not _is_step(until, dt):
             raise checks.input_error("until", until, f"a whole number of steps of dt = {dt:g} h")
-        own = self.target.time if isinstance(self.target, Observed) else None
         seen = max(self.target.times, default=None) if own is None else own
         if seen is not None and until is not None and until < seen * (1 - 1e-9):
             raise checks.input_error(
                 "until", until, f"at least {seen:g} h, when the target was observed"
             )
+        if own is not None and until is not None and until > own * (1 + 1e-6):
+            rule = f"{own:g} h, when the target was observed, or left out"
+            raise checks.input_error("until", until, rule)
         for time in self.target.times:
             if not _is_step(time, dt):
                 raise checks.input_error(

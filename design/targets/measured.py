@@ -74,7 +74,10 @@ class Measured(Target):
             checks.number(f"Measured.spread[{name!r}]", self.spread[name], above=0.0)
 
     def check(self, state: tf.State) -> None:
-        self._found(state)
+        try:
+            self._found(state)
+        except TypeError as error:
+            raise tf.InputError(str(error)) from error
 
     def unfit(self, state: tf.State) -> list[str]:
         bad = [
@@ -88,7 +91,8 @@ class Measured(Target):
         return "" if self.smooth else "measures of your own may pass no gradient (smooth=True)"
 
     def _found(self, state: tf.State) -> list[Tensor]:
-        """Each measure of each colony, (B,) float64."""
+        """Each measure of each colony, (B,) float64. Raises TypeError where a function gives what
+        is none: it may do so for some states only, and is no fault of a design."""
         out = []
         for name, function in self.functions.items():
             found = function(state)
@@ -98,8 +102,8 @@ class Measured(Target):
                     if isinstance(found, Tensor)
                     else found
                 )
-                rule = f"a function whose result has shape ({state.colonies},), one for each colony"
-                raise checks.input_error(f"Measured.functions[{name!r}]", got, rule)
+                rule = f"a tensor of shape ({state.colonies},), one number for each colony"
+                raise TypeError(f"Measured.functions[{name!r}] gave {got}: it must give {rule}.")
             out.append(found.double())
         return out
 

@@ -13,6 +13,7 @@ from design.targets.base import Target
 from design.targets.conditions import Conditions
 from design.targets.observed import Observed
 from design.targets.observed_course import CourseStatistics, ObservedCourse
+from design.targets.observed_measures import MeasureStatistics, ObservedMeasures, as_data
 from design.targets.statistics import ColonyStatistics
 from torchfilm import checks
 
@@ -22,7 +23,7 @@ class ConditionStatistics:
     """The statistics of each of several conditions, those of `plans`; `labels` are the conditions
     in words."""
 
-    plans: tuple[ColonyStatistics | CourseStatistics, ...]
+    plans: tuple[ColonyStatistics | CourseStatistics | MeasureStatistics, ...]
     labels: tuple[str, ...]
 
     @property
@@ -59,6 +60,7 @@ class ObservedConditions(Observed):
     conditions: Conditions = field(repr=False)
 
     def __init__(self, conditions: Conditions):
+        conditions = Conditions([(given, as_data(part)) for given, part in conditions.terms])
         parts = _checked(conditions)
         labels = tuple(conditions.label(k) for k in range(len(parts)))
         found = {
@@ -95,8 +97,19 @@ class ObservedConditions(Observed):
 
 
 def one_observed(data: object) -> object:
-    """Data of several conditions as one; anything else as it is."""
-    return ObservedConditions(data) if isinstance(data, Conditions) else data
+    """Data of several conditions, or measured numbers, as one; anything else as it is."""
+    if isinstance(data, Conditions):
+        return ObservedConditions(data)
+    return as_data(data) if isinstance(data, Target) else data
+
+
+def errors(observed: Observed) -> list[float]:
+    """The standard error of measurement of each statistic, (K,), that simulations do not have."""
+    if isinstance(observed, ObservedConditions):
+        return [e for part in observed.conditions.parts for e in errors(cast(Observed, part))]
+    if isinstance(observed, ObservedMeasures):
+        return list(observed.plan.errors)
+    return [0.0] * len(observed.values)
 
 
 def grown(observed: Observed) -> Target:
@@ -123,7 +136,7 @@ def _checked(conditions: Conditions) -> tuple[Observed, ...]:
     parts = tuple(part for part in conditions.parts if isinstance(part, Observed))
     if len(parts) < len(conditions.parts):
         other = next(part for part in conditions.parts if not isinstance(part, Observed))
-        rule = "of data under every condition: Observed, or ObservedCourse"
+        rule = "of data under every condition: Observed, ObservedCourse, or Measured"
         raise checks.input_error("Conditions.terms", other, rule)
     for what, of in (
         ("colonies", [part.colonies for part in parts]),

@@ -128,6 +128,15 @@ class Several(Target):
         self.of_parts(lambda part, own: part.draw(ax, state, place, own), state, history)
 
 
+def observed_at(target: Target) -> float | None:
+    """When the data of a target were observed at the end of a colony, h; None where it has none, or
+    they have no time."""
+    if isinstance(target, Observed):
+        return target.time
+    parts = target.parts if isinstance(target, Several) else ()
+    return next((time for time in map(observed_at, parts) if time is not None), None)
+
+
 class SumOfTargets(Several):
     """The base class of those whose loss is a sum of those of their parts, so that it has residuals
     where all parts have."""

@@ -9,8 +9,18 @@ import pytest
 import torch
 
 import torchfilm as tf
-from design import Conditions, Observed, ObservedCourse, Parameter, Search, Stripe, Task, infer
-from design.simulations import simulate_designs
+from design import (
+    Conditions,
+    Measured,
+    Observed,
+    ObservedCourse,
+    Parameter,
+    Search,
+    Stripe,
+    Task,
+    infer,
+)
+from design.simulations import simulate_designs, simulate_points
 from design.targets.observed_conditions import ObservedConditions
 
 K = [Parameter("half", 0.2, 5.0, log=True)]
@@ -133,3 +143,64 @@ def test_a_search_fits_the_same_data(data):
     search = Search(sensor, K, data, until=2.0, dt=0.1, replicates=2, seed=1)
     best = search.run(colonies=60, progress=False)
     assert best.values["half"] == pytest.approx(1.0, rel=0.3)
+
+
+# --- measured numbers ----------------------------------------------------------------------------
+
+
+def bulk(state):
+    """What a plate reader has: the mean over all cells by volume."""
+    return state.groups.sum(state.gfp.double() * state.volume) / state.groups.sum(state.volume)
+
+
+def read(value: float, error: float) -> Measured:
+    return Measured({"bulk": bulk}, {"bulk": value}, {"bulk": error})
+
+
+def level(iptg=1.0, make=20.0):
+    """Cells that are all alike, and at rest."""
+    circuit = tf.Circuit(at_rest, species="gfp", iptg=iptg, make=make)
+    return tf.Scene(circuit, founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]]), dim=2, dt=0.5)
+
+
+def at_rest(u, s, p, cell):
+    return {"gfp": 50.0 * (p.make * p.iptg - u.gfp)}
+
+
+MAKE = [Parameter("make", 10.0, 30.0)]
+QUICK = {"until": 1.0, "dt": 0.5, "progress": False}
+
+
+def test_simulations_have_the_errors_of_the_data(tmp_path):
+    """One for each simulation, the same in any batch; conditions have their own."""
+    two = Conditions([({"iptg": 1.0}, read(20.0, 2.0)), ({"iptg": 2.0}, read(40.0, 0.5))])
+    target = ObservedConditions(two).conditions
+    task = Task(level, MAKE, target, until=1.0, dt=0.5, replicates=1, replay=False)
+    found = simulate_designs(task, 300)
+    make = np.array([MAKE[0].value(float(x)) for x in found.points[:, 0]])
+    apart = found.statistics - np.stack([make, 2 * make], 1)
+    assert apart.std(0) == pytest.approx([2.0, 0.5], rel=0.15)
+    assert np.abs(apart.mean(0)) == pytest.approx([0.0, 0.0], abs=0.4)
+    assert abs(np.corrcoef(apart.T)[0, 1]) < 0.2
+    again = simulate_points(task, found.points[5:9], 5)
+    assert np.array_equal(again.statistics, found.statistics[5:9])
+
+
+@pytest.mark.skipif(find_spec("sbi") is None, reason='needs pip install -e ".[infer]"')
+def test_the_posterior_of_a_measured_number_is_as_wide_as_its_error():
+    """20 ± 1.5, with a flat prior: the interval of 90 % is 20 ± 1.645 · 1.5."""
+    found = infer(level, MAKE, read(20.0, 1.5), simulations=2000, samples=2000, flows=1, **QUICK)
+    low, high = found.interval()["make"]
+    assert (low, high) == pytest.approx((17.53, 22.47), abs=0.6)
+    narrow = found.predict(40).statistics
+    assert narrow.std() == pytest.approx(2**0.5 * 1.5, rel=0.35)
+    other = found.given(read(24.0, 1.5)).interval()["make"]
+    assert other == pytest.approx((low + 4.0, high + 4.0), abs=0.7)
+    with pytest.raises(tf.InputError, match="data of the same statistics"):
+        found.given(read(20.0, 0.5))
+
+
+def test_a_measured_range_is_no_data():
+    wide = Measured({"bulk": bulk}, {"bulk": (1.0, 2.0)}, {"bulk": 1.0})
+    with pytest.raises(tf.InputError, match=r"Measured\.wanted\['bulk'\] = .*one number, as data"):
+        infer(level, MAKE, wide, **QUICK)

@@ -9,10 +9,20 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 import torch
-from searching import grown
+from searching import grown, lit
 
 import torchfilm as tf
-from design import Objective, Observed, ObservedCourse, Parameter, Search, Task, Weighted, infer
+from design import (
+    Conditions,
+    Objective,
+    Observed,
+    ObservedCourse,
+    Parameter,
+    Search,
+    Task,
+    Weighted,
+    infer,
+)
 
 MAKE = [Parameter("make", 0.5, 2.0, log=True)]
 
@@ -200,3 +210,14 @@ def test_times_count_within_goals(course):
         Task(colony, MAKE, Weighted([(odd, 1.0)]), until=2.0, dt=0.1)
     with pytest.raises(tf.InputError, match="at least 2 h, when the target was observed"):
         Task(colony, MAKE, Weighted([(course, 1.0)]), until=1.0, dt=0.1)
+
+
+def test_a_search_ends_when_the_data_were_observed():
+    *_, state = tf.simulate(lit(), until=1.0, colonies=2, seed=3, dt=0.1)
+    data = replace(Observed.from_state(state), time=1.0)
+    make = [Parameter("make", 0.1, 10.0)]
+    twice = Conditions([({"decay": 1.0}, data), ({"decay": 2.0}, data)])
+    assert Task(lit, make, data, dt=0.1).until == Task(lit, make, twice, dt=0.1).until == 1.0
+    for target in (data, twice):
+        with pytest.raises(tf.InputError, match=r"until = 2.0 .*1 h, when the target was observed"):
+            Task(lit, make, target, until=2.0, dt=0.1)

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from searching import lit
 
 import torchfilm as tf
 from design import Local, Measured, Parameter, Search, Sobol, Task, Weighted
@@ -116,11 +117,11 @@ def test_a_saved_design_asks_for_it_again(tmp_path):
         (lambda: Measured({"a": longest}, {"a": 1}, {"a": 0}), r"spread\['a'\] = 0"),
         (
             lambda: task(Measured({"a": lambda s: s.length[:0]}, {"a": 1}, {"a": 1})),
-            r"functions\['a'\] = 'a tensor of shape \(0,\)",
+            r"functions\['a'\] gave a tensor of shape \(0,\)",
         ),
         (
             lambda: task(Measured({"a": lambda s: 2.0}, {"a": 1}, {"a": 1})),
-            r"functions\['a'\] = 2.0 is not allowed",
+            r"functions\['a'\] gave 2.0: it must give",
         ),
     ],
 )
@@ -161,3 +162,11 @@ def test_colonies_in_which_all_have_died(extinct, end):
     assert np.array_equal(alone.losses, found.losses[:1])
     ends = [part.state.counts.sum() for part in objective.colonies(np.array([1.0]))]
     assert sum(map(int, ends)) == 0 and bool(ends) == extinct
+
+
+def test_a_number_for_each_cell_is_no_failed_design():
+    """Founders are one cell a colony: what is wrong shows later, and ends the search."""
+    target = Measured({"level": lambda state: state.gfp}, {"level": 1.0}, {"level": 1.0})
+    search = Search(lit, [Parameter("make", 0.1, 10.0)], target, cells=6, replicates=2)
+    with pytest.raises(TypeError, match=r"functions\['level'\] gave .*one number for each colony"):
+        search.run(colonies=8, progress=False)

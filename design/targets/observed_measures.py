@@ -1,0 +1,88 @@
+"""Measured numbers as data for inference, each with its error: plate readers, counts, growth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+import torchfilm as tf
+from design.targets.base import Target
+from design.targets.measured import Measured
+from design.targets.observed import Observed
+from torchfilm import checks
+
+
+@dataclass(frozen=True)
+class MeasureStatistics:
+    """Measures of one's own: their names, the standard errors of the data, and a digest of their
+    code."""
+
+    names: tuple[str, ...]
+    errors: tuple[float, ...]
+    code: str
+    species: tuple[str, ...] = ()
+
+    @property
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """The names of the statistics by what they are about."""
+        return {"measures": self.names}
+
+
+@dataclass(frozen=True, init=False)
+class ObservedMeasures(Observed):
+    """The wanted values of `measured` as data: each was measured with an error, normal, whose
+    standard deviation is its spread. Simulations get such errors, too.
+
+    Raises InputError for a range in place of a value.
+    """
+
+    plan: MeasureStatistics  # type: ignore[assignment]
+    measured: Measured = field(repr=False)
+
+    def __init__(self, measured: Measured):
+        values = []
+        for name, (low, high) in measured.wanted.items():  # type: ignore[misc]
+            if low != high:
+                rule = "one number, as data have one"
+                raise checks.input_error(f"Measured.wanted[{name!r}]", (low, high), rule)
+            values.append(low)
+        spread = tuple(float(measured.spread[name]) for name in measured.functions)
+        code = tf.digest(dict(measured.functions))
+        found = {
+            "measured": measured,
+            "values": tuple(values),
+            "spread": spread,
+            "plan": MeasureStatistics(tuple(measured.functions), spread, code),
+            "colonies": 1,
+            "cells": 0,
+            "time": None,
+        }
+        for name, value in found.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def fewest(self) -> int:  # type: ignore[override]
+        return self.measured.fewest
+
+    def check(self, state: tf.State) -> None:
+        self.measured.check(state)
+
+    def unfit(self, state: tf.State) -> list[str]:
+        return self.measured.unfit(state)
+
+    def note(self, state: tf.State) -> Tensor | None:
+        return None
+
+    def statistics(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        """The measures of each colony, (B, K) float64."""
+        return torch.stack(list(self.measured.measures(state).values()), 1)
+
+    def describe(self) -> str:
+        return f"measured: {', '.join(self.plan.names)}"
+
+
+def as_data(target: Target) -> Target:
+    """Measured numbers as data; any other target as it is."""
+    return ObservedMeasures(target) if isinstance(target, Measured) else target
