@@ -195,9 +195,9 @@ def test_case_43_a_chamber_full_of_short_cells_stalls(measured, kind, dim, most,
     area = 2 * state.radius * state.length + math.pi * state.radius**2
     fill = float((area if dim == 2 else state.volume).sum()) / (2 * half) ** dim
     low, high = (0.86, 0.92) if dim == 2 else (0.6, 0.75)
-    assert low < measured("share of the chamber that is full", fill, f"{low} to {high}") < high
-    assert measured("mean overlap, µm", max(means), "≤ 0.03") <= 0.03
-    assert measured("worst overlap, µm", max(worst), f"≤ {most}") <= most
+    assert low < measured(f"share that is full, {kind}, {dim}-D", fill, f"≥ {low}") < high
+    assert measured(f"mean overlap, {kind}, µm", max(means), "≤ 0.03") <= 0.03
+    assert measured(f"worst overlap, {kind}, µm", max(worst), f"≤ {most}") <= most
 
 
 @pytest.mark.slow
