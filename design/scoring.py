@@ -205,7 +205,7 @@ def _grow_and_score(
             score = _scores(task.target, event)[first]
             score, why = _below_failed(task.target, score)
             reasons |= {divmod(ids[k], replicates): words for k, words in why.items()}
-            unfit = [_unfit(task, event.state, size)[k] for k in first]
+            unfit = np.array(_unfit(task, event.state, size))[first].tolist()
             reasons |= {divmod(k, replicates): w for k, w in zip(ids, unfit, strict=True) if w}
             good = np.isfinite(score) & np.array([not why for why in unfit])
             losses[ids] = np.where(good, score, task.target.failed)

@@ -115,8 +115,8 @@ class Conditions(SumOfTargets):
 
     def misses(self, found: Mapping[str, float]) -> dict[str, float]:
         out: dict[str, float] = {}
+        own = {self._of(name): x for name, x in found.items()}
         for k, part in enumerate(self.parts):
-            own = {self._of(name): x for name, x in found.items()}
             mine = {name: x for (name, place), x in own.items() if place == k}
             out |= {self._named(n, k): by for n, by in part.misses(mine).items()}
         return out

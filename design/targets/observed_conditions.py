@@ -12,39 +12,22 @@ import torchfilm as tf
 from design.targets.base import Target
 from design.targets.conditions import Conditions
 from design.targets.observed import Observed
-from design.targets.observed_course import CourseStatistics, ObservedCourse
+from design.targets.observed_course import CourseStatistics, JoinedStatistics, ObservedCourse
 from design.targets.observed_measures import MeasureStatistics, ObservedMeasures, as_data
 from design.targets.statistics import ColonyStatistics
 from torchfilm import checks
 
 
 @dataclass(frozen=True)
-class ConditionStatistics:
-    """The statistics of each of several conditions, those of `plans`; `labels` are the conditions
-    in words."""
+class ConditionStatistics(JoinedStatistics):
+    """The statistics of each of several conditions, those of `plans`; `conditions` in words."""
 
     plans: tuple[ColonyStatistics | CourseStatistics | MeasureStatistics, ...]
-    labels: tuple[str, ...]
+    conditions: tuple[str, ...]
 
     @property
-    def groups(self) -> dict[str, tuple[str, ...]]:
-        """The names of the statistics by what they are about, under each condition."""
-        pairs = zip(self.plans, self.labels, strict=True)
-        return {
-            _under(group, label): tuple(_under(name, label) for name in names)
-            for plan, label in pairs
-            for group, names in plan.groups.items()
-        }
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of all statistics, (K,)."""
-        return tuple(name for names in self.groups.values() for name in names)
-
-    @property
-    def species(self) -> tuple[str, ...]:
-        """All reporters."""
-        return tuple(dict.fromkeys(n for plan in self.plans for n in plan.species))
+    def labels(self) -> tuple[str, ...]:
+        return tuple(f"({words})" for words in self.conditions)
 
 
 @dataclass(frozen=True, init=False)
@@ -146,8 +129,3 @@ def _checked(conditions: Conditions) -> tuple[Observed, ...]:
             rule = f"of the same {what} under every condition, since they are simulated together"
             raise checks.input_error(f"{what} of Conditions", of, rule)
     return parts
-
-
-def _under(name: str, label: str) -> str:
-    """The name of a statistic, or a group, under a condition."""
-    return f"{name} ({label})"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.observed import FARTHEST, Observed
+from design.targets.observed_measures import MeasureStatistics
 from design.targets.statistics import LOG_CELLS, ColonyStatistics, birth_note
 from torchfilm import checks
 
@@ -21,20 +23,23 @@ if TYPE_CHECKING:
 NOTES = 2  # columns of a birth note
 
 
-@dataclass(frozen=True)
-class CourseStatistics:
-    """The statistics of each of several `times`, h: those of `plans`."""
+class JoinedStatistics(ABC):
+    """The statistics of several `plans`, each with a label in its name."""
 
-    plans: tuple[ColonyStatistics, ...]
-    times: tuple[float, ...]
+    plans: tuple[ColonyStatistics | JoinedStatistics | MeasureStatistics, ...]
+
+    @property
+    @abstractmethod
+    def labels(self) -> tuple[str, ...]:
+        """Of the plans."""
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
-        """The names of the statistics by what they are about, at each time."""
-        pairs = zip(self.plans, self.times, strict=True)
+        """The names of the statistics by what they are about, in each plan."""
+        pairs = zip(self.plans, self.labels, strict=True)
         return {
-            at(group, t): tuple(at(name, t) for name in names)
-            for plan, t in pairs
+            f"{group} {label}": tuple(f"{name} {label}" for name in names)
+            for plan, label in pairs
             for group, names in plan.groups.items()
         }
 
@@ -47,6 +52,18 @@ class CourseStatistics:
     def species(self) -> tuple[str, ...]:
         """All reporters."""
         return tuple(dict.fromkeys(n for plan in self.plans for n in plan.species))
+
+
+@dataclass(frozen=True)
+class CourseStatistics(JoinedStatistics):
+    """The statistics of each of several `times`, h: those of `plans`."""
+
+    plans: tuple[ColonyStatistics, ...]
+    times: tuple[float, ...]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(f"at {time:g} h" for time in self.times)
 
 
 @dataclass(frozen=True, init=False)
@@ -168,11 +185,6 @@ class ObservedCourse(Observed):
         times = ", ".join(f"{t:g}" for t in self.times)
         groups = dict.fromkeys(g for f in self.frames for g in f.plan.groups)
         return f"like {many} at {times} h, {self.cells} cells: {', '.join(groups)}"
-
-
-def at(name: str, time: float) -> str:
-    """The name of a statistic, or a group, at a time."""
-    return f"{name} at {time:g} h"
 
 
 def _plain(name: str) -> str:

@@ -274,7 +274,7 @@ def test_where_conditions_do_not_belong():
             make()
     with pytest.raises(tf.InputError, match="Conditions stand outermost"):
         Search(gate, MAKE, targets=[GATE, Burden()], cells=8)
-    with pytest.raises(tf.InputError, match="Observed"):
+    with pytest.raises(tf.InputError, match="one number, as data"):
         infer(gate, MAKE, GATE, cells=8)
     with pytest.raises(tf.InputError, match="replicates=2 colonies under each of 2 conditions"):
         search().run(colonies=3, progress=False)
