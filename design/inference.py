@@ -20,7 +20,7 @@ from design.simulations import Simulations, simulate_designs
 from design.targets.conditions import Conditions
 from design.targets.measured import Measured
 from design.targets.observed import Observed
-from design.targets.observed_conditions import grown, one_observed
+from design.targets.observed_conditions import checked_data, grown
 from design.task import Task
 from torchfilm import checks
 
@@ -75,7 +75,7 @@ def infer(
     extra), for the file of other simulations, and where fewer than 50 simulations succeed.
     """
     require_sbi()
-    data = _checked_data(observed)
+    data = checked_data(observed)
     for name, value, least in (
         ("simulations", simulations, LEAST), ("samples", samples, 10), ("flows", flows, 1),
         ("epochs", epochs, 1),
@@ -97,20 +97,6 @@ def infer(
     if posterior.other_sizes:
         warnings.warn(posterior.other_sizes, stacklevel=3)
     return posterior
-
-
-def _checked_data(observed: Any) -> Observed:
-    """The data, those of several conditions as one. Raises InputError for what is no data."""
-    if isinstance(observed, (list, tuple)):
-        raise tf.InputError(
-            "observed is one Observed, not a list: put data of several times together as"
-            " ObservedCourse([…])."
-        )
-    data = one_observed(observed)
-    if not isinstance(data, Observed):
-        rule = "an Observed, such as Observed.from_table(…), a Measured, or Conditions of these"
-        raise checks.input_error("observed", observed, rule)
-    return data
 
 
 def _check_end(seen: float | None, cells: int | None, until: float | None) -> None:

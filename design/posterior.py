@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from design.simulations import Simulations, random_points, shown_values, simulat
 from design.targets.conditions import Conditions
 from design.targets.measured import Measured
 from design.targets.observed import Observed
-from design.targets.observed_conditions import cells_each, one_observed
+from design.targets.observed_conditions import cells_each, checked_data
 from design.targets.statistics import LOG_CELLS
 from design.task import Task
 from torchfilm import checks
@@ -67,13 +66,13 @@ class Posterior:
     def given(self, observed: Observed | Measured | Conditions) -> Posterior:
         """The posterior for other data of the same statistics (`Observed.from_table(…, like=…)`)
         and as many colonies, without further simulations."""
-        data = cast(Observed, one_observed(observed))
+        data = checked_data(observed)
         if data.plan != self.observed.plan or data.colonies != self.observed.colonies:
             raise checks.input_error(
                 "observed",
                 data.describe(),
                 f"data of the same statistics from {self.observed.colonies} colonies",
-                "Make it with like=….",
+                "Make it with like=…; of Measured, with the same functions and spreads.",
             )
         when = self.observed.time if self.task.until is None else self.task.until
         now = data.time

@@ -180,7 +180,8 @@ def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.nda
     counts = np.full(len(streams), np.nan)
     reasons: dict[int, str] = {}
     cells, until = task.end(1.0)
-    for event in grow(prepared, cells=cells, until=until, note=observed.note):
+    fewest = task.target.fewest
+    for event in grow(prepared, cells=cells, until=until, note=observed.note, fewest=fewest):
         if isinstance(event, FailedColony):
             reasons[event.colony_id // each] = event.reason
             continue

@@ -19,7 +19,6 @@ BATCH, WIDTH = 24, 0.5
 # designs before the first descents (less than one race, whose end they await), and for each
 # parameter of a descent, so that it ends
 BEFORE, EACH, MOST_STARTS = 5, 10, 3
-BEFORE_FIT = 16  # designs before the descents of a fit, which no small colonies help
 # designs of a batch of a race where every design needs many replicates
 FEW = 12
 # designs of a batch of a model, and at most in a search, since its time grows as the cube of all
@@ -109,7 +108,7 @@ def choose(
         return every
     if designs < least:
         return few
-    ways, first = (descents, BEFORE) if pattern else (fits, BEFORE_FIT)
+    ways, first = (descents, BEFORE) if pattern else (fits, BATCH)
     starts = min(int((designs - first) / (EACH * dimensions)), MOST_STARTS)
     if squares and starts > 0 and not chance and (designs >= LEAST_RACED or not pattern):
         return ways[starts - 1]
@@ -142,9 +141,9 @@ def _fits(cloud: CMAES, data: str) -> tuple[Chosen, ...]:
     """Descents of a fit to data, from one start and from more, side by side."""
     return tuple(
         Chosen(
-            Polish(inner=cloud, after=BEFORE_FIT, starts=starts),
-            f"{data}; {BEFORE_FIT} designs of CMA-ES, then by gradients from the best, since the"
-            " loss is a sum of squares with exact derivatives",
+            Polish(inner=cloud, after=BATCH, starts=starts),
+            f"{data}; {BATCH} designs of CMA-ES, then by gradients from the best, since the loss is"
+            " a sum of squares with exact derivatives",
         )
         for starts in range(1, MOST_STARTS + 1)
     )

@@ -56,6 +56,9 @@ class Conditions(SumOfTargets):
             rule = "conditions that differ"
             raise checks.input_error("Conditions.terms", [g for g, _ in terms], rule)
         object.__setattr__(self, "terms", tuple((dict(given), part) for given, part in terms))
+        if len({self.label(k) for k in range(len(terms))}) < len(terms):
+            rule = "conditions that differ in six digits, since measures bear their names"
+            raise checks.input_error("Conditions.terms", [g for g, _ in terms], rule)
         object.__setattr__(self, "parts", tuple(part for _, part in terms))
 
     @property

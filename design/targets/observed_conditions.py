@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -58,6 +58,9 @@ class ObservedConditions(Observed):
         for name, value in found.items():
             object.__setattr__(self, name, value)
 
+    def without(self, *groups: str) -> Observed:
+        raise tf.InputError("leave statistics out of the data of each condition.")
+
     def unfit(self, state: tf.State) -> list[str]:
         return self.conditions.unfit(state)
 
@@ -77,6 +80,20 @@ class ObservedConditions(Observed):
         groups = dict.fromkeys(g for plan in self.plan.plans for g in plan.groups)
         under = f"under each of {len(self.plan.labels)} conditions{when}"
         return f"like {many} {under}, {self.cells} cells in all: {', '.join(groups)}"
+
+
+def checked_data(observed: Any) -> Observed:
+    """Data as one. Raises InputError for what is none."""
+    if isinstance(observed, (list, tuple)):
+        raise tf.InputError(
+            "observed is one Observed, not a list: put data of several times together as"
+            " ObservedCourse([…])."
+        )
+    data = one_observed(observed)
+    if not isinstance(data, Observed):
+        rule = "an Observed, such as Observed.from_table(…), a Measured, or Conditions of these"
+        raise checks.input_error("observed", observed, rule)
+    return data
 
 
 def one_observed(data: object) -> object:
@@ -101,10 +118,11 @@ def grown(observed: Observed) -> Target:
 
 
 def cells_each(observed: Observed) -> float:
-    """How many cells of a colony were observed at the end, on average; 0 where none are known."""
+    """How many cells of a colony were observed at the end, on average; 0 where some are not
+    known."""
     if isinstance(observed, ObservedConditions):
         parts = [cells_each(cast(Observed, part)) for part in observed.conditions.parts]
-        return sum(parts) / len(parts)
+        return sum(parts) / len(parts) if all(parts) else 0.0
     last = observed.frames[-1] if isinstance(observed, ObservedCourse) else observed
     return last.cells / last.colonies
 

@@ -69,6 +69,9 @@ class ObservedMeasures(Observed):
     def check(self, state: tf.State) -> None:
         self.measured.check(state)
 
+    def without(self, *groups: str) -> Observed:
+        raise tf.InputError("leave measures out of Measured(…).")
+
     def unfit(self, state: tf.State) -> list[str]:
         return self.measured.unfit(state)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -107,6 +107,9 @@ class Several(Target):
     @property
     def bounds(self) -> dict[str, str]:
         return {name: bound for part in self.parts for name, bound in part.bounds.items()}
+
+    def misses(self, found: Mapping[str, float]) -> dict[str, float]:
+        return {n: by for part in self.parts for n, by in part.misses(found).items()}
 
     @property
     def evidence(self) -> dict[str, tuple[float, float]]:

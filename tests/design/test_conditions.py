@@ -248,6 +248,7 @@ def test_a_picture_shows_one_replicate_under_each_condition(tmp_path):
     [
         ([({"iptg": 0.0}, DARK)], "two at least"),
         ([({"iptg": 0.0}, DARK), ({"iptg": 0.0}, LIT)], "conditions that differ"),
+        ([({"iptg": 1234567.0}, DARK), ({"iptg": 1234568.0}, LIT)], "that differ in six digits"),
         ([({"iptg": 0.0}, DARK), ({"x": 1.0}, LIT)], "of the same names in each"),
         ([({"iptg": 0.0}, DARK), ({}, LIT)], "of the same names in each"),
         ([({"iptg": "no"}, DARK), ({"iptg": 1.0}, LIT)], "iptg = 'no' .* a number"),

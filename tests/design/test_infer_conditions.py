@@ -21,7 +21,8 @@ from design import (
     infer,
 )
 from design.simulations import simulate_designs, simulate_points
-from design.targets.observed_conditions import ObservedConditions
+from design.targets.observed_conditions import ObservedConditions, cells_each
+from design.targets.observed_measures import as_data
 
 K = [Parameter("half", 0.2, 5.0, log=True)]
 DOSES = 0.2, 1.0, 5.0
@@ -204,3 +205,25 @@ def test_a_measured_range_is_no_data():
     wide = Measured({"bulk": bulk}, {"bulk": (1.0, 2.0)}, {"bulk": 1.0})
     with pytest.raises(tf.InputError, match=r"Measured\.wanted\['bulk'\] = .*one number, as data"):
         infer(level, MAKE, wide, **QUICK)
+
+
+def killed(rate=1.0):
+    founders = tf.Cells([[3.0 * k, 0.0] for k in range(6)], [[1.0, 0.0]] * 6)
+    return tf.Scene(tf.Lysis(rate=rate), founders=founders, dim=2, dt=0.1)
+
+
+def test_colonies_in_which_all_have_died_are_data_where_they_count():
+    """With a high rate none is left, which is what was seen."""
+    count = lambda state: state.counts.double()
+    rates = [Parameter("rate", 0.01, 30.0, log=True)]
+    for extinct in (True, False):
+        seen = Measured({"left": count}, {"left": 0.0}, {"left": 1e-6}, extinct=extinct)
+        task = Task(
+            killed, rates, as_data(seen), until=1.0, dt=0.1, replicates=1, replay=False
+        )  # fmt: skip
+        found = simulate_points(task, np.array([[1.0], [0.0]]), 0)
+        assert found.sound.tolist() == [extinct, True]
+        assert found.statistics[1, 0] == pytest.approx(6.0, abs=0.1)
+    assert cells_each(as_data(seen)) == 0.0
+    with pytest.raises(tf.InputError, match="leave measures out"):
+        as_data(seen).without("left")

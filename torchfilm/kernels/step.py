@@ -187,7 +187,7 @@ def _prepared(memory, x, axis, growth, radius, drag, last, number, rising, hardn
     """Puts what a pass starts from into its arrays. Returns rows of cells at walls, with room for
     those of `found`, how many there are, and the deepest gap."""
     length, least, half, (reach, root), (alpha, low), scale, y, _, _ = arrays
-    most = max(SLOWEST * limits[0] / (hardness * softer), 1.0)
+    most = max(SLOWEST * limits[0] / hardness, 1.0)
     slower = min(SLOWER ** max(number - LONG_MOVES, 0), most)
     drags(length, radius, drag[0], drag[1], growth, slower, scale, dof)
     _put_start(y, last, scale, number == 0, rising)

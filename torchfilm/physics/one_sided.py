@@ -336,7 +336,7 @@ class _OneStep:
         turns = settings.degrees - settings.dim - 1
         length_drag = torch.where(rigid, torch.inf, given.length_drag)
         if number > LONG_MOVES:
-            most = (SLOWEST * self.softest / hardness).clamp(min=1.0)
+            most = (SLOWEST * self.softest / at.hardness).clamp(min=1.0)
             slower = self.of_cells(most.clamp(max=SLOWER ** (number - LONG_MOVES)))
             across, turning = slower * across, slower * turning
         drag = [across] * settings.dim + [turning] * turns + [length_drag]
