@@ -109,7 +109,8 @@ def choose(
     if designs < least:
         return few
     ways, first = (descents, BEFORE) if pattern else (fits, BATCH)
-    starts = min(int((designs - first) / (EACH * dimensions)), MOST_STARTS)
+    room = (designs if pattern else searched or designs) - first
+    starts = min(int(room / (EACH * dimensions)), MOST_STARTS)
     if squares and starts > 0 and not chance and (designs >= LEAST_RACED or not pattern):
         return ways[starts - 1]
     if designs > most or not botorch:

@@ -79,7 +79,8 @@ class ObservedConditions(Observed):
         when = "" if self.time is None else f" at {self.time:g} h"
         groups = dict.fromkeys(g for plan in self.plan.plans for g in plan.groups)
         under = f"under each of {len(self.plan.labels)} conditions{when}"
-        return f"like {many} {under}, {self.cells} cells in all: {', '.join(groups)}"
+        cells = f", {self.cells} cells in all" if self.cells else ""
+        return f"like {many} {under}{cells}: {', '.join(groups)}"
 
 
 def checked_data(observed: Any) -> Observed:

@@ -82,13 +82,16 @@ def test_the_file_serves_other_data_but_no_other_simulations(data, tmp_path):
     assert other.values != data.values
     assert alike(simulate_designs(task_of(other), 4, path=path), one)
     for options, word in (
-        ({"until": 3.0}, "until"),
+        ({"dt": 0.05}, "dt"),
         ({"seed": 1}, "seed"),
         ({"replicates": 1}, "replicates"),
         ({"parameters": [Parameter("rate", 0.5, 2.0, log=True)]}, "parameters"),
     ):
         with pytest.raises(tf.InputError, match=f"differs in .*{word}"):
             simulate_designs(task_of(data, **options), 4, path=path)
+    later = replace(data, time=3.0)
+    with pytest.raises(tf.InputError, match="differs in .*until"):
+        simulate_designs(task_of(later, until=3.0), 4, path=path)
     with pytest.raises(tf.InputError, match="differs in target"):
         simulate_designs(task_of(data.without("cells")), 4, path=path)
     path.write_text("no HDF5")

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
 
-import torch
 from torch import Tensor
 
 from torchfilm.signals.schedule import Schedule, checked_values
@@ -79,11 +78,7 @@ class Robin(Face):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "value", _checked("Robin.value", self.value))
-        made = checks.value("Robin.transfer", self.transfer, least=0.0)
-        if not bool((torch.as_tensor(made) > 0).all()):
-            raise checks.input_error(
-                "Robin.transfer", self.transfer, "above 0, µm/h", "NoFlux() lets nothing pass."
-            )
+        made = checks.value("Robin.transfer", self.transfer, above=0.0)
         object.__setattr__(self, "transfer", made)
 
     def outside_value(self) -> Kept | Schedule:
