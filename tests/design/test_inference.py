@@ -90,7 +90,7 @@ def test_the_file_serves_other_data_but_no_other_simulations(data, tmp_path):
         with pytest.raises(tf.InputError, match=f"differs in .*{word}"):
             simulate_designs(task_of(data, **options), 4, path=path)
     later = replace(data, time=3.0)
-    with pytest.raises(tf.InputError, match="differs in .*until"):
+    with pytest.raises(tf.InputError, match=r"differs in .*until"):
         simulate_designs(task_of(later, until=3.0), 4, path=path)
     with pytest.raises(tf.InputError, match="differs in target"):
         simulate_designs(task_of(data.without("cells")), 4, path=path)
