@@ -109,10 +109,9 @@ def choose(
     if designs < least:
         return few
     ways, first = (descents, BEFORE) if pattern else (fits, BATCH)
-    room = (designs if pattern else searched or designs) - first
-    starts = min(int(room / (EACH * dimensions)), MOST_STARTS)
-    if squares and starts > 0 and not chance and (designs >= LEAST_RACED or not pattern):
-        return ways[starts - 1]
+    room = int(((designs if pattern else searched or designs) - first) / (EACH * dimensions))
+    if squares and room > 0 and not chance and (designs >= LEAST_RACED or not pattern):
+        return ways[min(room, MOST_STARTS) - 1]
     if designs > most or not botorch:
         return race if pattern else fit
     return modelled if alone else learnt
