@@ -84,8 +84,7 @@ def infer(
     _check_end(data.time, cells, until)
     kept = None if path is None else checks.file_path("path", path)
     task = Task(
-        scene, parameters, grown(data), cells=cells,
-        until=data.time if until is None and cells is None else until,
+        scene, parameters, grown(data), cells=cells, until=until,
         replicates=data.colonies if replicates is None else replicates,
         fixed=fixed, seed=seed, dt=dt, dtype=dtype, device=device, replay=False,
     )  # fmt: skip

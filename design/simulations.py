@@ -26,7 +26,7 @@ from design.parameters import Value
 from design.prior import Prior
 from design.scoring import WorkItem, cut_work_items
 from design.targets.observed import Observed
-from design.targets.observed_conditions import errors, one_observed, places
+from design.targets.observed_conditions import checked_data, errors, places
 from design.task import Task
 from torchfilm import checks
 
@@ -80,9 +80,7 @@ class Simulations:
 
 def observed_of(task: Task) -> Observed:
     """The data of a task of inference."""
-    observed = one_observed(task.target)
-    assert isinstance(observed, Observed)
-    return observed
+    return checked_data(task.target)
 
 
 def about(task: Task, prior: Prior) -> dict[str, Any]:

@@ -84,24 +84,18 @@ class ObservedConditions(Observed):
 
 
 def checked_data(observed: Any) -> Observed:
-    """Data as one. Raises InputError for what is none."""
+    """Data of several conditions, or measured numbers, as one; other data as they are. Raises
+    InputError for what is none."""
     if isinstance(observed, (list, tuple)):
         raise tf.InputError(
             "observed is one Observed, not a list: put data of several times together as"
             " ObservedCourse([…])."
         )
-    data = one_observed(observed)
+    data = ObservedConditions(observed) if isinstance(observed, Conditions) else as_data(observed)
     if not isinstance(data, Observed):
         rule = "an Observed, such as Observed.from_table(…), a Measured, or Conditions of these"
         raise checks.input_error("observed", observed, rule)
     return data
-
-
-def one_observed(data: object) -> object:
-    """Data of several conditions, or measured numbers, as one; anything else as it is."""
-    if isinstance(data, Conditions):
-        return ObservedConditions(data)
-    return as_data(data) if isinstance(data, Target) else data
 
 
 def errors(observed: Observed) -> list[float]:

@@ -52,11 +52,11 @@ SOFTER, MOST_SOFTER = 8.0, 8.0**5
 # 8 passes at most, one step in 27 left a pair deeper than 0.3 µm; so, none did in 8 colonies.)
 HOPS, MOST_HOPS = 3, 9
 LONG_MOVES, SHORTER = 4, 1 / 3
-# In each pass after LONG_MOVES the drag of moves and turns is SLOWER times higher, that of lengths
-# is not. Where a chamber of short cells is full, moves of several µm cost less than growth that is
-# taken back: all would be cut short, none would have made room, and growth would go on until cells
-# lie in each other. The drag is at most SLOWEST times higher where contacts are softest, and as
-# much more as they are harder: else cells that lie deep would not part.
+# In each pass after LONG_MOVES the drag of moves and turns is SLOWER times that of the pass before,
+# that of lengths is not. Where a chamber of short cells is full, moves of several µm cost less than
+# growth that is taken back: all would be cut short, none would have made room, and growth would go
+# on until cells lie in each other. The drag is at most SLOWEST times higher where contacts are
+# softest, and as much more as they are harder: else cells that lie deep would not part.
 SLOWER, SLOWEST = 4.0, 12.0
 # No cell turns by more than this in one pass, rad. Bilateral contacts have the same bound.
 MAX_TURN = 0.5

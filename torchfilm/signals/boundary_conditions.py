@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, cast
+from typing import Any, Self, cast
 
 from torch import Tensor
 
@@ -44,27 +44,32 @@ class Periodic(Face):
 
 
 @dataclass(frozen=True)
-class Dirichlet(Face):
+class _Valued(Face):
+    """The base of faces with a value ≥ 0."""
+
+    value: checks.Value | Schedule
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "value", _checked(f"{type(self).__name__}.value", self.value))
+
+    def outside_value(self) -> Kept | Schedule:
+        return cast("Kept | Schedule", self.value)
+
+    def take(self, colonies: Tensor) -> Self:
+        return replace(self, value=_take(self.value, colonies))
+
+
+@dataclass(frozen=True)
+class Dirichlet(_Valued):
     """The concentration at the face itself is `value` ≥ 0: one number or one per colony, or a
     `Schedule` of them.
 
     The face is half a voxel from the nearest centre.
     """
 
-    value: checks.Value | Schedule
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "value", _checked("Dirichlet.value", self.value))
-
-    def outside_value(self) -> Kept | Schedule:
-        return cast("Kept | Schedule", self.value)
-
-    def take(self, colonies: Tensor) -> Face:
-        return replace(self, value=_take(self.value, colonies))
-
 
 @dataclass(frozen=True)
-class Robin(Face):
+class Robin(_Valued):
     """Through the face enters `transfer` · (`value` − concentration at the face): a boundary layer
     of still medium, a membrane, or a film beyond which the concentration is `value`.
 
@@ -73,44 +78,27 @@ class Robin(Face):
     thickness L µm. A flow passes the layer too.
     """
 
-    value: checks.Value | Schedule
     transfer: checks.Value
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "value", _checked("Robin.value", self.value))
+        super().__post_init__()
         made = checks.value("Robin.transfer", self.transfer, above=0.0)
         object.__setattr__(self, "transfer", made)
-
-    def outside_value(self) -> Kept | Schedule:
-        return cast("Kept | Schedule", self.value)
 
     def numbers(self) -> list[Any]:
         return [self.value, self.transfer]
 
-    def take(self, colonies: Tensor) -> Face:
-        return replace(
-            self, value=_take(self.value, colonies), transfer=_take(self.transfer, colonies)
-        )
+    def take(self, colonies: Tensor) -> Self:
+        return replace(super().take(colonies), transfer=_take(self.transfer, colonies))
 
 
 @dataclass(frozen=True)
-class Flux(Face):
+class Flux(_Valued):
     """`value` enters through the face, by diffusion and flow together, per area and hour,
     concentration · µm/h, wherever no obstacle closes it.
 
     value: ≥ 0, one number or one per colony, or a `Schedule` of them.
     """
-
-    value: checks.Value | Schedule
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "value", _checked("Flux.value", self.value))
-
-    def outside_value(self) -> Kept | Schedule:
-        return cast("Kept | Schedule", self.value)
-
-    def take(self, colonies: Tensor) -> Face:
-        return replace(self, value=_take(self.value, colonies))
 
 
 @dataclass(frozen=True)
