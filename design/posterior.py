@@ -18,7 +18,7 @@ from design.simulations import Simulations, random_points, shown_values, simulat
 from design.targets.conditions import Conditions
 from design.targets.measured import Measured
 from design.targets.observed import Observed
-from design.targets.observed_conditions import cells_each, checked_data
+from design.targets.observed_conditions import averaged, cells_each, checked_data
 from design.targets.statistics import LOG_CELLS
 from design.task import Task
 from torchfilm import checks
@@ -67,7 +67,8 @@ class Posterior:
         """The posterior for other data of the same statistics (`Observed.from_table(…, like=…)`)
         and as many colonies, without further simulations."""
         data = checked_data(observed)
-        if data.plan != self.observed.plan or data.colonies != self.observed.colonies:
+        colonies = [averaged(of, of.colonies) for of in (data, self.observed)]
+        if data.plan != self.observed.plan or colonies[0] != colonies[1]:
             raise checks.input_error(
                 "observed",
                 data.describe(),

@@ -26,7 +26,7 @@ from design.parameters import Value
 from design.prior import Prior
 from design.scoring import WorkItem, cut_work_items
 from design.targets.observed import Observed
-from design.targets.observed_conditions import checked_data, errors, places
+from design.targets.observed_conditions import averaged, checked_data, errors, places
 from design.task import Task
 from torchfilm import checks
 
@@ -193,11 +193,19 @@ def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.nda
     # of the colonies of a replicate, each statistic is that of the one under its condition
     columns = np.arange(len(observed.values))
     shape = (len(item.rows), task.replicates, task.conditions, len(columns))
-    means = found.reshape(shape)[:, :, places(observed), columns].mean(1)
+    each_own = found.reshape(shape)[:, :, places(observed), columns]
+    means = _means(each_own, np.array(averaged(observed, task.replicates)))
     for k in np.flatnonzero(~np.isfinite(means).all(1)).tolist():
         reasons.setdefault(k, "a statistic is not finite")
     size = counts.reshape(len(item.rows), each).mean(1).tolist()
     return [(row, means[k], size[k], reasons.get(k, "")) for k, row in enumerate(item.rows)]
+
+
+def _means(found: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Of each statistic over its first `count` (K,) replicates: (n, K) from (n, R, K). NaN where
+    any replicate is."""
+    within = np.arange(found.shape[1])[:, None] < count
+    return (found * within).sum(1) / count
 
 
 def random_points(task: Task, prior: Prior, count: int, *, stream: int) -> np.ndarray:

@@ -190,6 +190,14 @@ def of_one_condition(name: str, part: Target) -> None:
         raise checks.input_error(f"{name}: a target", part.describe(), rule, hint)
 
 
+def ended_elsewhere(state: tf.State, time: float | None) -> str:
+    """Why colonies that ended now cannot be compared with data of a `time`, h; "" where they
+    can."""
+    if time is None or abs(state.time - time) <= 1e-6 * time:
+        return ""
+    return f"it ended at {state.time:g} h, and was observed at {time:g} h: set until"
+
+
 def known(state: tf.State) -> list[str]:
     """The names that a target can read: fields with one number for each cell, and signals as
     "out.NAME"."""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import WORST, Target
+from design.targets.base import WORST, Target, ended_elsewhere
 from torchfilm import checks
 
 Measure = Callable[[tf.State], Tensor]
@@ -36,6 +36,9 @@ class Measured(Target):
     smooth: say True where the functions have derivatives by all that the parameters change, as
     means of levels have, and counts of cells do not: then least squares search with exact
     derivatives, where the scene has them. Where a function has none, they are wrong in silence.
+
+    time: h, when the values were measured, at which colonies then end. Measures of several times
+    make a course: `ObservedCourse([Measured(…, time=1.0), Measured(…, time=2.0)])`.
     """
 
     failed = WORST
@@ -46,6 +49,7 @@ class Measured(Target):
     _: KW_ONLY
     extinct: bool = False
     smooth: bool = False
+    time: float | None = None
 
     @property
     def fewest(self) -> int:  # type: ignore[override]
@@ -54,6 +58,8 @@ class Measured(Target):
     def __post_init__(self) -> None:
         checks.choice("Measured.extinct", self.extinct, (True, False))
         checks.choice("Measured.smooth", self.smooth, (True, False))
+        if self.time is not None:
+            checks.number("Measured.time", self.time, above=0.0)
         if not isinstance(self.functions, Mapping) or not self.functions:
             rule = "a dict of functions by name, such as {'order': tf.measure.nematic_order}"
             raise checks.input_error("Measured.functions", self.functions, rule)
@@ -84,11 +90,16 @@ class Measured(Target):
             (name, found.isnan())
             for name, found in zip(self.functions, self._found(state), strict=True)
         ]
+        late = ended_elsewhere(state, self.time)
         why = [", ".join(n for n, nan in bad if bool(nan[k])) for k in range(state.colonies)]
-        return [f"{names} is not a number" if names else "" for names in why]
+        return [f"{names} is not a number" if names else late for names in why]
 
     def why_rough(self, state: tf.State) -> str:
         return "" if self.smooth else "measures of your own may pass no gradient (smooth=True)"
+
+    def found(self, state: tf.State) -> Tensor:
+        """The measures of each colony, (B, K) float64, with their gradients."""
+        return torch.stack(self._found(state), 1)
 
     def _found(self, state: tf.State) -> list[Tensor]:
         """Each measure of each colony, (B,) float64. Raises TypeError where a function gives what

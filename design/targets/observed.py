@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import Target, require, species_names
+from design.targets.base import Target, ended_elsewhere, require, species_names
 from design.targets.observed_masks import masks_table
 from design.targets.observed_table import read_table, warn_of_empty
 from design.targets.statistics import (
@@ -48,8 +48,9 @@ class Observed(Target):
     The statistics are ln of the number of cells; the quantiles 10, 25, 50, 75 and 90 % of lengths
     and ages; the radius of gyration; cells per µm² in rings around the centre; the alignment of
     neighbours, mean cos 2φ; and for each reporter its mean, its means in the rings, Moran's I (the
-    correlation between neighbours) and its coefficient of variation between cells. Neighbours are
-    cells with centres closer than `reach`. All are seen from above, in the x–y plane.
+    correlation between neighbours), its coefficient of variation between cells, and with
+    quantiles=True its quantiles. Neighbours are cells with centres closer than `reach`. All are
+    seen from above, in the x–y plane.
 
     Loss: the mean over the statistics of ((statistic − value)/spread)². It is about 1 for a colony
     that grew as the observed ones did. It has no upper limit but 100², a statistic 100 spreads off.
@@ -98,6 +99,7 @@ class Observed(Target):
         columns: Mapping[str, str] | None = None,
         length_with_caps: bool = False,
         relative: bool = False,
+        quantiles: bool = False,
         rings: int = 4,
         reach: float = 3.0,
         time: float | None = None,
@@ -114,8 +116,9 @@ class Observed(Target):
         or "min".
 
         length_with_caps: lengths include the caps, as masks measure them. relative: levels count
-        relative to their mean in the colony, for a reporter in arbitrary units. rings: how many,
-        out to where 95 % of the cells are. reach: µm; cells with closer centres are neighbours.
+        relative to their mean in the colony, for a reporter in arbitrary units. quantiles: those
+        of each reporter are compared, too, as where cells are in two states. rings: how many, out
+        to where 95 % of the cells are. reach: µm; cells with closer centres are neighbours.
         time: h, when the colonies were observed. like: another `Observed`, whose rings and options
         are taken, so that both compare the same statistics; and its species, where none are given.
 
@@ -127,7 +130,7 @@ class Observed(Target):
         names = _names(species, like)
         units = tf.tables.Units(pixel_size, length_unit, angle_unit, time_unit)
         cells = read_table(table, names, units, columns or {}, length_with_caps)
-        plan = known_statistics(cells, names, rings, reach, length_with_caps, relative)
+        plan = known_statistics(cells, names, rings, reach, length_with_caps, relative, quantiles)
         return _observed(cells, plan if like is None else _shared(plan, like), time)
 
     @staticmethod
@@ -143,6 +146,7 @@ class Observed(Target):
         drop: str | Sequence[str] = (),
         least_area: int = 30,
         relative: bool = False,
+        quantiles: bool = False,
         rings: int = 4,
         reach: float = 3.0,
         time: float | None = None,
@@ -165,8 +169,8 @@ class Observed(Target):
         if species is None:
             species = tuple(fluorescence or ()) if like is None else like.plan.species
         return Observed.from_table(
-            table, species=species, length_with_caps=caps, relative=relative, rings=rings,
-            reach=reach, time=time, like=like,
+            table, species=species, length_with_caps=caps, relative=relative, quantiles=quantiles,
+            rings=rings, reach=reach, time=time, like=like,
         )  # fmt: skip
 
     @staticmethod
@@ -178,6 +182,7 @@ class Observed(Target):
         history: Tensor | None = None,
         length_with_caps: bool = False,
         relative: bool = False,
+        quantiles: bool = False,
         rings: int = 4,
         reach: float = 3.0,
         like: Observed | None = None,
@@ -199,18 +204,11 @@ class Observed(Target):
             raise checks.input_error("Observed.from_state(history)", history, rule)
         length_with_caps = _caps(length_with_caps, like)
         whole = ColonyStatistics(
-            True,
-            history is not None,
-            True,
-            True,
-            names,
-            (0.0, 1.0),
-            1.0,
-            length_with_caps,
+            True, history is not None, True, True, names, (0.0, 1.0), 1.0, length_with_caps,
             relative,
-        )
+        )  # fmt: skip
         cells = seen_cells(state, whole, history)
-        plan = known_statistics(cells, names, rings, reach, length_with_caps, relative)
+        plan = known_statistics(cells, names, rings, reach, length_with_caps, relative, quantiles)
         plan = plan if like is None else _shared(plan, like)
         return _observed(cells, plan, state.time or None)
 
@@ -223,6 +221,7 @@ class Observed(Target):
         species: Sequence[str] = (),
         length_with_caps: bool = False,
         relative: bool = False,
+        quantiles: bool = False,
         rings: int = 4,
         reach: float = 3.0,
         like: Observed | None = None,
@@ -244,7 +243,7 @@ class Observed(Target):
         }
         return Observed.from_table(
             columns, species=species, length_with_caps=length_with_caps, relative=relative,
-            rings=rings, reach=reach, time=now or None, like=like,
+            quantiles=quantiles, rings=rings, reach=reach, time=now or None, like=like,
         )  # fmt: skip
 
     @property
@@ -274,10 +273,7 @@ class Observed(Target):
         self.plan.check(state)
 
     def unfit(self, state: tf.State) -> list[str]:
-        if self.time is None or abs(state.time - self.time) <= 1e-6 * self.time:
-            return [""] * state.colonies
-        why = f"it ended at {state.time:g} h, and was observed at {self.time:g} h: set until"
-        return [why] * state.colonies
+        return [ended_elsewhere(state, self.time)] * state.colonies
 
     def note(self, state: tf.State) -> Tensor | None:
         """Time and next uid of each colony, (B, 2), which tell when cells were born; None where

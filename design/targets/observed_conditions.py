@@ -35,8 +35,8 @@ class ObservedConditions(Observed):
     """The data of `conditions` as one: the statistics of all, each with its condition in its name,
     such as "gfp_mean (iptg = 10)".
 
-    Raises InputError for conditions that are not all data, of different numbers of colonies, or
-    where colonies would not end at one time.
+    Raises InputError for conditions that are not all data, or where colonies would not end at one
+    time.
     """
 
     plan: ConditionStatistics  # type: ignore[assignment]
@@ -51,7 +51,7 @@ class ObservedConditions(Observed):
             "values": tuple(v for part in parts for v in part.values),
             "spread": tuple(v for part in parts for v in part.spread),
             "plan": ConditionStatistics(tuple(part.plan for part in parts), labels),
-            "colonies": parts[0].colonies,
+            "colonies": max(part.colonies for part in parts),
             "cells": sum(part.cells for part in parts),
             "time": parts[0].time,
         }
@@ -102,6 +102,8 @@ def errors(observed: Observed) -> list[float]:
     """The standard error of measurement of each statistic, (K,), that simulations do not have."""
     if isinstance(observed, ObservedConditions):
         return [e for part in observed.conditions.parts for e in errors(cast(Observed, part))]
+    if isinstance(observed, ObservedCourse):
+        return [e for frame in observed.frames for e in errors(frame)]
     if isinstance(observed, ObservedMeasures):
         return list(observed.plan.errors)
     return [0.0] * len(observed.values)
@@ -110,6 +112,21 @@ def errors(observed: Observed) -> list[float]:
 def grown(observed: Observed) -> Target:
     """The target of the task in which inference grows the colonies of some data."""
     return observed.conditions if isinstance(observed, ObservedConditions) else observed
+
+
+def averaged(observed: Observed, replicates: int) -> list[int]:
+    """Over how many of the `replicates` of a simulation each statistic is averaged, (K,): over as
+    many as colonies were observed of it, where all are simulated that the best observed had."""
+    return [-(-replicates * n // observed.colonies) for n in _colonies(observed)]
+
+
+def _colonies(observed: Observed) -> list[int]:
+    """Of how many colonies each statistic is, (K,)."""
+    if isinstance(observed, ObservedConditions):
+        return [n for part in observed.conditions.parts for n in _colonies(cast(Observed, part))]
+    if isinstance(observed, ObservedCourse):
+        return [n for frame in observed.frames for n in _colonies(frame)]
+    return [observed.colonies] * len(observed.values)
 
 
 def cells_each(observed: Observed) -> float:
@@ -134,11 +151,8 @@ def _checked(conditions: Conditions) -> tuple[Observed, ...]:
         other = next(part for part in conditions.parts if not isinstance(part, Observed))
         rule = "of data under every condition: Observed, ObservedCourse, or Measured"
         raise checks.input_error("Conditions.terms", other, rule)
-    for what, of in (
-        ("colonies", [part.colonies for part in parts]),
-        ("time", [part.time for part in parts]),
-    ):
-        if len(set(of)) > 1:
-            rule = f"of the same {what} under every condition, since they are simulated together"
-            raise checks.input_error(f"{what} of Conditions", of, rule)
+    times = [part.time for part in parts]
+    if len(set(times)) > 1:
+        rule = "the same under every condition, since they are simulated together"
+        raise checks.input_error("time of Conditions", times, rule)
     return parts

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 import torchfilm as tf
+from design.targets.base import ended_elsewhere
+from design.targets.measured import Measure, Measured
 from design.targets.observed import FARTHEST, Observed
-from design.targets.observed_measures import MeasureStatistics
+from design.targets.observed_measures import MeasureStatistics, ObservedMeasures, as_data
 from design.targets.statistics import LOG_CELLS, ColonyStatistics, birth_note
 from torchfilm import checks
 
@@ -58,7 +60,7 @@ class JoinedStatistics(ABC):
 class CourseStatistics(JoinedStatistics):
     """The statistics of each of several `times`, h: those of `plans`."""
 
-    plans: tuple[ColonyStatistics, ...]
+    plans: tuple[ColonyStatistics | MeasureStatistics, ...]
     times: tuple[float, ...]
 
     @property
@@ -69,22 +71,24 @@ class CourseStatistics(JoinedStatistics):
 @dataclass(frozen=True, init=False)
 class ObservedCourse(Observed):
     """Colonies like those that were observed at several times: `ObservedCourse([one, two, three])`,
-    of `Observed` with a `time` each, for a search or `infer`.
+    of `Observed` with a `time` each, for a search or `infer`. Numbers that a plate reader or a
+    count gives at each time are a course by `of_measures`.
 
-    frames: in the order of their times, of the same number of colonies; whether each frame shows
-    the same colonies does not matter. A simulated colony is compared at each of these times, which
-    must be whole numbers of steps, and ends at the last one. Ages are compared in the last frame
-    only. The statistics of frame k have its time in their names: "gfp_mean at 2 h".
+    frames: in the order of their times, each an `Observed` or a `Measured`; whether each frame
+    shows the same colonies, or as many, does not matter. A simulated colony is compared at each of
+    these times, which must be whole numbers of steps, and ends at the last one. Ages are compared
+    in the last frame only. The statistics of frame k have its time in their names: "gfp_mean at
+    2 h".
 
     The loss is that of `Observed` with the statistics of all frames, each weighted alike. They are
-    not independent: one colony is seen several times. Raises InputError for frames without a time,
-    in another order, or of different numbers of colonies.
+    not independent: one colony is seen several times. Raises InputError for frames without a time
+    or in another order.
     """
 
     plan: CourseStatistics  # type: ignore[assignment]
     frames: tuple[Observed, ...] = field(repr=False)
 
-    def __init__(self, frames: Sequence[Observed]):
+    def __init__(self, frames: Sequence[Observed | Measured]):
         given = _checked(frames)
         kept = tuple(f.without("age") if f.plan.ages else f for f in given[:-1]) + given[-1:]
         times = tuple(float(f.time or 0.0) for f in kept)
@@ -93,12 +97,35 @@ class ObservedCourse(Observed):
             "values": tuple(v for f in kept for v in f.values),
             "spread": tuple(v for f in kept for v in f.spread),
             "plan": CourseStatistics(tuple(f.plan for f in kept), times),
-            "colonies": kept[-1].colonies,
+            "colonies": max(f.colonies for f in kept),
             "cells": sum(f.cells for f in kept),
             "time": times[-1],
         }
         for name, value in found.items():
             object.__setattr__(self, name, value)
+
+    @staticmethod
+    @checks.known_keywords
+    def of_measures(
+        functions: Mapping[str, Measure],
+        *,
+        times: Sequence[float],
+        values: Mapping[str, Any],
+        spread: Mapping[str, Any],
+        extinct: bool = False,
+        smooth: bool = False,
+    ) -> ObservedCourse:
+        """Measures of your own at several times, such as those of a plate reader:
+
+            ObservedCourse.of_measures({"od": volume}, times=(1, 2, 3),
+                                       values={"od": (0.1, 0.2, nan)}, spread={"od": 0.01})
+
+        functions, extinct, smooth: as of `Measured`. times: h, in their order. values: by name, as
+        many numbers as times, NaN where one is missing; a pandas.DataFrame will do. spread: by
+        name, a standard error above 0, or one for each time. Raises InputError for other names,
+        lengths or times, and where fewer than two times have a value.
+        """
+        return ObservedCourse(_measured(functions, times, values, spread, extinct, smooth))
 
     @property
     def times(self) -> tuple[float, ...]:
@@ -116,6 +143,16 @@ class ObservedCourse(Observed):
     def check(self, state: tf.State) -> None:
         for frame in self.frames:
             frame.check(state)
+
+    @property
+    def fewest(self) -> int:  # type: ignore[override]
+        return max(frame.fewest for frame in self.frames)
+
+    def unfit(self, state: tf.State) -> list[str]:
+        return self.frames[-1].unfit(state)
+
+    def why_rough(self, state: tf.State) -> str:
+        return next(filter(None, (frame.why_rough(state) for frame in self.frames)), "")
 
     def note(self, state: tf.State) -> Tensor:
         """What tells the ages of the last frame, and the statistics of each frame but the last
@@ -143,13 +180,23 @@ class ObservedCourse(Observed):
         earlier = torch.where(seen.any(0), earlier, math.nan)
         return torch.cat([earlier, self.frames[-1].statistics(state, history)], 1)
 
+    def _reached(self, state: tf.State, history: Tensor) -> list[Tensor]:
+        """Whether each colony was seen at the time of each frame, (B, 1) bool each; of one that
+        reached none, the last frame tells most."""
+        noted = history[:, :, 0]  # the time of each step
+        earlier = [((noted - t).abs() <= 1e-6 * t).any(0) for t in self.times[:-1]]
+        ended = not ended_elsewhere(state, self.times[-1])
+        last = ~torch.stack(earlier).any(0) | ended
+        return [reached.unsqueeze(1) for reached in (*earlier, last)]
+
     def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         """As of `Observed`; of the frames that were reached, in a colony that is grown for a part
         of its time only, as a first look of `Racing`."""
         found = self.statistics(state, history)
+        assert history is not None  # statistics need it
         apart = (found - found.new_tensor(self.values)) / found.new_tensor(self.spread)
         parts = apart.split([len(f.values) for f in self.frames], 1)
-        reached = [~x.isnan().all(1, keepdim=True) for x in parts]
+        reached = self._reached(state, history)
         kept = torch.cat([torch.where(r, x, 0.0) for r, x in zip(reached, parts, strict=True)], 1)
         count = sum((r * x.shape[1] for r, x in zip(reached, parts, strict=True)), reached[0] * 0)
         return kept.clamp(-FARTHEST, FARTHEST) / count.clamp(min=1).double().sqrt()
@@ -181,8 +228,11 @@ class ObservedCourse(Observed):
         self.frames[-1].draw(ax, state, place)
 
     def describe(self) -> str:
-        many = f"{self.colonies} observed colon" + ("ies" if self.colonies > 1 else "y")
         times = ", ".join(f"{t:g}" for t in self.times)
+        if all(isinstance(f, ObservedMeasures) for f in self.frames):
+            names = dict.fromkeys(n for f in self.frames for n in f.plan.names)
+            return f"measured at {times} h: {', '.join(names)}"
+        many = f"{self.colonies} observed colon" + ("ies" if self.colonies > 1 else "y")
         groups = dict.fromkeys(g for f in self.frames for g in f.plan.groups)
         return f"like {many} at {times} h, {self.cells} cells: {', '.join(groups)}"
 
@@ -196,22 +246,63 @@ def _checked(frames: object) -> tuple[Observed, ...]:
     rule = "two or more Observed(…, time=…), in the order of their times"
     if not isinstance(frames, Sequence) or len(frames) < 2:
         raise checks.input_error("ObservedCourse.frames", frames, rule)
-    for k, frame in enumerate(frames):
+    found: list[Observed] = []
+    for k, frame in enumerate(map(as_data, frames)):
         if not isinstance(frame, Observed) or isinstance(frame, ObservedCourse):
-            raise checks.input_error(f"ObservedCourse.frames[{k}]", frame, "an Observed")
+            rule = "an Observed or a Measured"
+            raise checks.input_error(f"ObservedCourse.frames[{k}]", frame, rule)
         if frame.time is None:
             raise checks.input_error(
                 f"ObservedCourse.frames[{k}].time", None, "the time of the frame, h",
                 "Give time=… where you read it.",
             )  # fmt: skip
-        if k and frame.time <= (frames[k - 1].time or 0.0):
+        if k and frame.time <= (found[-1].time or 0.0):
             raise checks.input_error(
                 f"ObservedCourse.frames[{k}].time", frame.time,
-                f"above that of the frame before, {frames[k - 1].time:g} h",
+                f"above that of the frame before, {found[-1].time:g} h",
             )  # fmt: skip
-        if frame.colonies != frames[0].colonies:
-            raise checks.input_error(
-                f"ObservedCourse.frames[{k}].colonies", frame.colonies,
-                f"as many colonies as in the first frame, {frames[0].colonies}",
-            )  # fmt: skip
-    return tuple(frames)
+        found.append(frame)
+    return tuple(found)
+
+
+def _measured(
+    functions: Any, times: Any, values: Any, spread: Any, extinct: bool, smooth: bool
+) -> list[Measured]:
+    """The measures at each time, of those that are known there."""
+    call = "ObservedCourse.of_measures"
+    rule = "a dict of functions by name, such as {'od': total_volume}"
+    if not isinstance(functions, Mapping) or not functions:
+        raise checks.input_error(f"{call}: functions", functions, rule)
+    moments = checks.vector(f"{call}: times", times)
+    columns = {}
+    for option, given in (("values", values), ("spread", spread)):
+        if not hasattr(given, "keys") or set(given.keys()) != set(functions):
+            rule = f"numbers by the names {', '.join(map(repr, functions))}"
+            raise checks.input_error(f"{call}: {option}", given, rule)
+        for name in functions:
+            label = f"{call}: {option}[{name!r}]"
+            columns[option, name] = _column(label, given[name], len(moments), option == "spread")
+    frames = []
+    for k, time in enumerate(moments):
+        there = [name for name in functions if not math.isnan(columns["values", name][k])]
+        parts = [
+            {name: columns[option, name][k] for name in there} for option in ("values", "spread")
+        ]
+        known = {name: functions[name] for name in there}
+        if known:
+            frames.append(Measured(known, *parts, extinct=extinct, smooth=smooth, time=time))
+    return frames
+
+
+def _column(label: str, given: Any, count: int, one_will_do: bool) -> list[float]:
+    """A number for each time, NaN where one is missing."""
+    if one_will_do and isinstance(given, (int, float)):
+        return [float(given)] * count
+    try:
+        found = [float(x) for x in given]
+    except (TypeError, ValueError):
+        found = []
+    if len(found) != count:
+        rule = f"{count} numbers, one for each time, NaN where it is missing"
+        raise checks.input_error(label, given, "a number, or " * one_will_do + rule)
+    return found

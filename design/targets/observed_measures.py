@@ -1,10 +1,9 @@
-"""Measured numbers as data for inference, each with its error: plate readers, counts, growth."""
+"""Measured numbers as data, each with its error: plate readers, counts, growth."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import torch
 from torch import Tensor
 
 import torchfilm as tf
@@ -23,6 +22,8 @@ class MeasureStatistics:
     errors: tuple[float, ...]
     code: str
     species: tuple[str, ...] = ()
+    ages: bool = False
+    positions: bool = False
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
@@ -57,7 +58,7 @@ class ObservedMeasures(Observed):
             "plan": MeasureStatistics(tuple(measured.functions), spread, code),
             "colonies": 1,
             "cells": 0,
-            "time": None,
+            "time": measured.time,
         }
         for name, value in found.items():
             object.__setattr__(self, name, value)
@@ -75,12 +76,12 @@ class ObservedMeasures(Observed):
     def unfit(self, state: tf.State) -> list[str]:
         return self.measured.unfit(state)
 
-    def note(self, state: tf.State) -> Tensor | None:
-        return None
+    def why_rough(self, state: tf.State) -> str:
+        return self.measured.why_rough(state)
 
     def statistics(self, state: tf.State, history: Tensor | None = None) -> Tensor:
-        """The measures of each colony, (B, K) float64."""
-        return torch.stack(list(self.measured.measures(state).values()), 1)
+        """The measures of each colony, (B, K) float64, with their gradients."""
+        return self.measured.found(state)
 
     def describe(self) -> str:
         return f"measured: {', '.join(self.plan.names)}"

@@ -10,6 +10,7 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import Target
+from design.targets.measured import Measured
 from design.targets.observed import Observed
 
 if TYPE_CHECKING:
@@ -48,11 +49,13 @@ class Several(Target):
     def check(self, state: tf.State) -> None:
         for part in self.parts:
             part.check(state)
-        seen = sorted({p.time for p in self.parts if isinstance(p, Observed) and p.time})
+        seen = sorted(set(_times(self)))
         if len(seen) > 1:
+            under = len(self.arguments) > 1
+            cure = "give data of one time" if under else "put them together as ObservedCourse([…])"
             raise tf.InputError(
-                f"{type(self).__name__} has data of {', '.join(f'{t:g}' for t in seen)} h, and a"
-                " colony ends at one time: put them together as ObservedCourse([…])."
+                f"{type(self).__name__} has data of {', '.join(f'{t:g}' for t in seen)} h, and"
+                f" {'all colonies end' if under else 'a colony ends'} at one time: {cure}."
             )
 
     def why_rough(self, state: tf.State) -> str:
@@ -131,13 +134,18 @@ class Several(Target):
         self.of_parts(lambda part, own: part.draw(ax, state, place, own), state, history)
 
 
+def _times(target: Target) -> list[float]:
+    """When the data of a target were observed at the end of a colony, h, those of all parts."""
+    if isinstance(target, Several):
+        return [time for part in target.parts for time in _times(part)]
+    own = target.time if isinstance(target, Observed | Measured) else None
+    return [] if own is None else [own]
+
+
 def observed_at(target: Target) -> float | None:
     """When the data of a target were observed at the end of a colony, h; None where it has none, or
     they have no time."""
-    if isinstance(target, Observed):
-        return target.time
-    parts = target.parts if isinstance(target, Several) else ()
-    return next((time for time in map(observed_at, parts) if time is not None), None)
+    return next(iter(_times(target)), None)
 
 
 class SumOfTargets(Several):

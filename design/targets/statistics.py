@@ -4,7 +4,7 @@ alike."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -56,7 +56,7 @@ class ColonyStatistics:
     are known. species: reporters. edges: of the rings around the centre of the colony, µm, the
     first 0. reach: cells whose centres are closer are neighbours, µm. length_with_caps: lengths
     include the caps. relative: levels count relative to the mean of their colony. omitted: groups
-    that are left out.
+    that are left out. quantiles: whether those of levels are compared.
     """
 
     lengths: bool
@@ -69,6 +69,8 @@ class ColonyStatistics:
     length_with_caps: bool
     relative: bool
     omitted: tuple[str, ...] = ()
+    # not shown: files of simulations know their statistics by name, and older ones have none
+    quantiles: bool = field(default=False, repr=False)
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
@@ -95,6 +97,8 @@ class ColonyStatistics:
                 found[f"{name} profile"] = tuple(f"{name}_ring_{k}" for k in rings)
                 found[f"{name} neighbours"] = (f"{name}_neighbours",)
             found[f"{name} variation"] = (f"{name}_cv",)
+            if self.quantiles:
+                found[f"{name} quantiles"] = tuple(f"{name}_{p}" for p in percent)
         return found
 
     def check(self, state: tf.State) -> None:
@@ -154,8 +158,9 @@ class ColonyStatistics:
     def _reporter(
         self, level: Tensor, cells: SeenCells, radius: Tensor | None, pairs: Tensor | None
     ) -> Tensor:
-        """Mean, means in rings, correlation between neighbours and coefficient of variation of one
-        reporter, (B, …). An empty ring counts as one with the mean of the colony."""
+        """Mean, means in rings, correlation between neighbours, coefficient of variation and
+        quantiles of one reporter, (B, …). An empty ring counts as one with the mean of the
+        colony."""
         mean = _means(level.unsqueeze(1), cells)
         scale = torch.where(mean != 0, mean, 1.0) if self.relative else torch.ones_like(mean)
         parts = [] if self.relative else [mean]
@@ -168,7 +173,10 @@ class ColonyStatistics:
             filled = count > 0
             profile = torch.where(filled, amount / torch.where(filled, count, 1.0), mean)
             parts += [profile / scale, _correlation(level, mean, cells, pairs)]
-        return torch.cat([*parts, _variation(level, mean, cells)], 1)
+        parts.append(_variation(level, mean, cells))
+        if self.quantiles:
+            parts.append(_quantiles(level, cells) / scale)
+        return torch.cat(parts, 1)
 
 
 def seen_cells(state: tf.State, plan: ColonyStatistics, history: Tensor | None) -> SeenCells:
@@ -267,12 +275,16 @@ def known_statistics(
     reach: float,
     length_with_caps: bool,
     relative: bool,
+    quantiles: bool,
 ) -> ColonyStatistics:
     """The statistics of all that is known of some cells."""
     checks.integer("Observed(rings)", rings, least=1, most=50)
     checks.number("Observed(reach)", reach, above=0.0)
     checks.choice("Observed(length_with_caps)", length_with_caps, (True, False))
     checks.choice("Observed(relative)", relative, (True, False))
+    checks.choice("Observed(quantiles)", quantiles, (True, False))
+    if quantiles and not species:
+        raise checks.input_error("Observed(quantiles)", True, "with species=(…), of which they are")
     edges: tuple[float, ...] = ()
     if cells.position is not None:
         outer = float(np.quantile(from_centre(cells.position, cells).cpu().numpy(), INNER))
@@ -288,6 +300,7 @@ def known_statistics(
         reach=reach,
         length_with_caps=length_with_caps,
         relative=relative,
+        quantiles=quantiles,
     )
 
 

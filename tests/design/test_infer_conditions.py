@@ -130,7 +130,6 @@ def test_the_posterior_of_a_dose_response_covers_the_truth(data):
     ("second", "words"),
     [
         (lambda: Stripe("gfp", at=0.0, width=4.0), "of data under every condition"),
-        (lambda: seen(1.0, colonies=3), r"colonies of Conditions = \[2, 3\]"),
         (lambda: seen(1.0, until=1.0), r"time of Conditions = \[2.0, 1.0\]"),
     ],
 )

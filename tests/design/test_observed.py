@@ -214,6 +214,34 @@ def test_the_loss_has_gradients_by_the_levels(seen):
     assert float(slope @ step) == pytest.approx(float(found), rel=1e-4)
 
 
+def test_quantiles_of_levels_tell_two_states_apart(seen):
+    """Half of the cells dark and half lit; or all in between, with the same mean."""
+    state, _ = seen
+    lit = torch.arange(state.cells) % 2
+    two = state.with_fields(gfp=0.2 + 1.6 * lit.to(state.gfp))
+    target = Observed.from_state(two, species=["gfp"], quantiles=True)
+    assert target.plan.groups["gfp quantiles"] == tuple(f"gfp_{q}" for q in (10, 25, 50, 75, 90))
+    found = statistics(target, state)
+    for k in range(state.colonies):
+        gfp = state.select([k]).gfp.double().numpy()
+        for q in (10, 25, 50, 75, 90):
+            assert found[f"gfp_{q}"][k] == pytest.approx(np.quantile(gfp, q / 100))
+    only = [g for g in target.plan.groups if g != "gfp quantiles"]
+    tenth = statistics(target.without(*only), two)
+    assert tenth["gfp_10"].tolist() == pytest.approx([0.2] * 4)
+    # no two alike, where quantiles have kinks
+    step = torch.randn(state.cells, dtype=torch.float64, generator=torch.manual_seed(0))
+    level = (state.gfp.double() + 0.01 * step.flip(0)).requires_grad_()
+    (slope,) = torch.autograd.grad(target.loss(state.with_fields(gfp=level)).sum(), level)
+    loss = lambda h: float(target.loss(state.with_fields(gfp=level.detach() + h * step)).sum())
+    assert float(slope @ step) == pytest.approx((loss(1e-6) - loss(-1e-6)) / 2e-6, rel=1e-4)
+    half = state.with_fields(gfp=0.5 * two.gfp)
+    free = Observed.from_state(two, species=["gfp"], quantiles=True, relative=True)
+    assert torch.allclose(free.statistics(two), free.statistics(half))
+    with pytest.raises(tf.InputError, match=r"Observed\(quantiles\) = True.*species"):
+        Observed.from_state(state, quantiles=True)
+
+
 def test_groups_can_be_left_out(seen):
     state, _ = seen
     target = Observed.from_state(state, species=["gfp"])

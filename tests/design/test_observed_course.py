@@ -149,7 +149,6 @@ def test_colonies_are_the_same_in_any_batch(course):
         (lambda a, b: [b, a], r"frames\[1\].time = 1.0 is not allowed.*above that of the frame"),
         (lambda a, b: [a, replace(b, time=None)], r"frames\[1\].time = None"),
         (lambda a, b: [a, 3], r"frames\[1\] = 3 is not allowed"),
-        (lambda a, b: [a, replace(b, colonies=7)], "as many colonies as in the first frame, 2"),
         (lambda a, b: [a, ObservedCourse([a, b])], "an Observed"),
     ],
 )
