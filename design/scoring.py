@@ -261,10 +261,8 @@ def _below_failed(target: Target, score: np.ndarray) -> tuple[np.ndarray, dict[i
     why = {}
     for k, number in enumerate(score.tolist()):
         if not math.isfinite(number):
-            of_data = ": one of the measures that it compares was not a number" * bool(
-                target.evidence
-            )
-            why[k] = f"the target's loss was {number}{of_data}"
+            of_data = ": one of the measures that it compares was not a number"
+            why[k] = f"the target's loss was {number}{of_data if target.evidence else ''}"
         elif number > target.failed:
             why[k] = (
                 f"the target's loss was {number:g}, above {target.failed:g}, that of a failed"
