@@ -154,15 +154,21 @@ class Together:
         those where it does, but cells take what is not there."""
         changed = {}
         overdrawn = torch.zeros_like(fixed.failed, dtype=torch.float64)
-        wanted = torch.zeros_like(overdrawn)
+        wanted, unequal = torch.zeros_like(overdrawn), torch.zeros_like(fixed.failed)
         total = lambda amount: state.groups.sum(amount)
         for name, moved in outcome.moved.items():
             old, released = state.fields[OUTSIDE + name], outcome.released[name].double()
-            end, beyond = step.transport[name].settled(moved, released)
+            end, beyond, apart = step.transport[name].settled(moved, released)
+            pool, given = step.transport[name].pool.detach(), released.detach()
+            held = given.abs() + pool * moved.mean.detach()
+            taken = given.clamp(max=0.0).neg()
+            pool, held, taken, apart = total(
+                torch.stack([pool, held, taken, apart.detach().abs()], 1)
+            ).unbind(1)
+            unequal |= apart > LOST * self.rtol * held + self.finest * pool
             changed[OUTSIDE + name] = end.to(old.dtype)
             overdrawn = overdrawn + beyond.detach()
-            wanted = wanted + total(released.detach().clamp(max=0.0).neg())
-            wanted = wanted + NOTHING * self.finest * total(step.transport[name].pool.detach())
+            wanted = wanted + taken + NOTHING * self.finest * pool
             if f"{name}_reservoir" in state.fields:
                 away = total(torch.where(step.fed, 0.0, released))
                 changed[f"{name}_reservoir"] = state.fields[f"{name}_reservoir"] + away
@@ -174,7 +180,7 @@ class Together:
             none = torch.zeros_like(fixed.iterations)
             noted = {"iterations": fixed.iterations, "overdrawn": overdrawn, "unsolved": none}
             made = circuit.reported(made, report, None, step.done, noted)
-        return made, fixed.failed | greedy, greedy
+        return made, fixed.failed | unequal | greedy, greedy
 
 
 class _Step:

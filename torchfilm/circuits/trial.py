@@ -126,7 +126,8 @@ def _largest(found: Iterable[Tensor]) -> float:
 
 def _is_small(size: float, atol: float) -> bool:
     """Whether errors of concentrations of this size count as nothing, and nobody has wished so."""
-    return 0 < SMALL * size < atol <= ATOL
+    bound = atol * (1 + 1e-6) if atol == ATOL else atol  # 1e-6 itself, in any type of numbers
+    return 0 < SMALL * size < bound and atol <= ATOL
 
 
 def _warn_if_small(label: str, what: str, size: float, atol: float) -> None:

@@ -22,7 +22,7 @@ from torchfilm.kernels.uptake import (
 )
 
 # As in `signals.joint`.
-EMPTY = 1e9
+EMPTY = 1e15
 
 
 @kernel
@@ -233,7 +233,7 @@ def move_turned(
         )  # fmt: skip
         for i in range(size):
             u[i], du[i] = values[start + i], dvalues[start + i]
-        at, grid = with_losses(dt, operator, room, settings)
+        at, grid, _ = with_losses(dt, operator, room, far[c], settings)
         times, good = at * dt, True
         if far[c]:
             turned = more, dmore, dloss

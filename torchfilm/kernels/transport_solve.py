@@ -123,8 +123,8 @@ def _times(factor, b, x, r):
 @kernel
 def backward_euler(x, b, r, pad, grid, many, tolerance, rounding, symmetric, most, spare):
     """Solve (I + many (I − P)) x = b for one grid, from x, and leave the residual in r. Whether it
-    converged. tolerance: of the residual over b. rounding: times many, over x. spare: `SPARE` rows,
-    0 in their padding."""
+    converged. tolerance: of the residual over b. rounding: of the residual over x, times the
+    diagonal, whose inverse is left in spare[6]. spare: `SPARE` rows, 0 in their padding."""
     inverse, stay, inner = spare[6, pad : pad + b.size], grid[1], x[pad : pad + b.size]
     small = _is_small(b, inner)
     if small:
@@ -135,8 +135,12 @@ def backward_euler(x, b, r, pad, grid, many, tolerance, rounding, symmetric, mos
         product(x, r, pad, grid, many)
         for i in range(b.size):
             r[i] = b[i] - r[i]
-        # a product is a difference of numbers that are so many times as large
-        target = max(tolerance**2 * dot(b, b), (rounding * many) ** 2 * dot(inner, inner))
+        # a product is a difference of numbers that are so many times as large; voxels from which
+        # cells take at a high rate hold little
+        least = 0.0
+        for i in range(b.size):
+            least += (inner[i] / inverse[i]) ** 2
+        target = max(tolerance**2 * dot(b, b), rounding**2 * least)
         if trial == 3 or not dot(r, r) > target:
             break
         if symmetric:

@@ -132,19 +132,23 @@ def operator_of(c, strides, stay, ups, downs, wrap_to, wrap_from, wraps, rate, s
 
 
 @kernel
-def with_losses(dt, operator, room, settings):
-    """λ, with the losses in room, and the operator at this λ, which uses `still` of the room."""
+def with_losses(dt, operator, room, far, settings):
+    """λ, with the losses in room; the operator at this λ, which uses `still` of the room; and
+    whether it is for backward Euler, as it stays once it is `far`."""
     strides, stay, ups, downs, wrap_to, wrap_from, wraps, rate, _ = operator
     loss, still, mixed, fastest = room[0], room[1], room[8], 0.0
     for i in range(loss.size):
         still[i] = (1 - stay[i]) * rate + loss[i]
         fastest = max(fastest, still[i])
     at = settings[0] * fastest if fastest > 0 else 1.0
+    far = far or at * dt > settings[2]
+    if far:  # any λ will do; at the greatest loss rate, rounding would hide what others exchange
+        at = rate
     scale = rate / at
     for i in range(loss.size):
         still[i] = 1 - still[i] / at
     grid = strides, still, ups * scale, downs * scale, wrap_to, wrap_from, wraps * scale, mixed
-    return at, grid
+    return at, grid, far
 
 
 @kernel
@@ -156,10 +160,9 @@ def carry_once(u, more, dt, pad, operator, room, far, least, settings):
     colony, its λ, and whether there is no flow.
     """
     _, _, x, r, b, final, mean, spare, _, weights, tails = room
-    _, cut, events, tolerance, rounding, most = settings
-    at, grid = with_losses(dt, operator, room, settings)
+    _, cut, _, tolerance, rounding, most = settings
+    at, grid, far = with_losses(dt, operator, room, far, settings)
     times, symmetric = at * dt, operator[8]
-    far = far or times > events
     if not far:
         used = poisson(times, cut, weights, tails)
         series(u, pad, grid, weights, tails, used, more / at, times, final, mean, spare)
@@ -172,6 +175,13 @@ def carry_once(u, more, dt, pad, operator, room, far, least, settings):
     for i in range(u.size):
         x[pad + i] = max(x[pad + i], 0.0)
     product(x, r, pad, grid, times)
+    below = False
+    for i in range(u.size):
+        if x[pad + i] + b[i] - r[i] < 0:  # where less is left than the residual, leave none
+            below = True
+            x[pad + i] = max(x[pad + i] + (b[i] - r[i]) * spare[6, pad + i], 0.0)
+    if below:
+        product(x, r, pad, grid, times)
     for i in range(u.size):
         # with its residual the change is what T makes of x: amount is conserved
         mean[i], final[i] = x[pad + i], max(x[pad + i] + b[i] - r[i], 0.0)

@@ -27,8 +27,10 @@ from torchfilm.tools.ragged import Groups
 from torchfilm.tools.tangents import both, has_tangent, no_derivatives, only_forward, with_tangent
 
 TINY = 1e-300
-# Of the rate at which a cell takes, times the step: it then takes all there is.
-EMPTY = 1e9
+# Of the rate at which a cell takes, times the step: it then takes all there is. At a smaller one
+# cells that eat faster than diffusion brings would get more than that: a law such as s/(K + s) asks
+# for as much at 1e-10 of what there was.
+EMPTY = 1e15
 
 
 class Moved(NamedTuple):
@@ -152,9 +154,10 @@ class JointTransport:
             before = vars(self)["_last"] = released, mean, made
         return before[2]
 
-    def settled(self, moved: Moved, released: Tensor) -> tuple[Tensor, Tensor]:
+    def settled(self, moved: Moved, released: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The signal at the end, (voxels,), to which cells have given exactly what they released,
-        up to rounding; and what they took beyond what there was, (B,), conc·µm³.
+        up to rounding; what they took beyond what there was, (B,), conc·µm³; and by how much each
+        took more than transport gave it, (N,).
 
         The iteration leaves a difference within its tolerance. It is written where the cell is; and
         what is not there, is taken from all voxels of the colony in proportion to what they hold.
@@ -163,15 +166,15 @@ class JointTransport:
         left, there = wanted + moved.taken, read(moved.end, self.stencil)
         here = torch.maximum(left, -0.5 * there * self.pool)
         end, missing = write(moved.end, here, self.stencil, there), here - left
-        none = missing.new_zeros(self.groups.size)
         if not bool((missing > 0).any()):
-            return end, none
+            return end, missing.new_zeros(self.groups.size), left
         of_grids = Groups(self.grid.owner, self.groups.size, ordered=True)
         content = of_grids.sum(end) * self.grid.voxel_volume
         missing = self.groups.sum(missing)
         kept = (1 - missing / content.clamp(min=TINY)).clamp(min=0.0)
         kept = torch.where(missing > 0, kept, 1.0)
-        return end * kept.index_select(0, self.grid.owner), (missing - content).clamp(min=0.0)
+        end = end * kept.index_select(0, self.grid.owner)
+        return end, (missing - content).clamp(min=0.0), left
 
     def _spread(self, per_cell: Tensor) -> Tensor:
         """(N,) to the voxels."""

@@ -91,8 +91,8 @@ class Unsplit:
 
     @cached_property
     def rounding(self) -> Tensor:
-        """Of the residual, relative to the solution, (B or 1,)."""
-        return ROUNDING * self.dt * both(self.operator.loss.detach())[0].flatten(1).amax(1)
+        """Of the residual, relative to the solution, (B or 1, nx, ny, nz)."""
+        return ROUNDING / self.inverse
 
     def step(self, u: Tensor) -> Tensor:
         """u (B, nx, ny, nz) one step later; NaN in a colony whose solve did not converge."""
@@ -131,6 +131,10 @@ class Unsplit:
             x = x.clamp(min=0.0) if self.theta == 1 else x
             # the change is then what T makes of x, which conserves amount to rounding
             residual = bare(right) - still(x)
+            if self.theta == 1:  # where less is left than the residual, leave none
+                low = x + residual < 0
+                x = torch.where(low, (x + residual * self.inverse).clamp(min=0.0), x)
+                residual = bare(right) - still(x)
             x = x + residual
             moved = both(right - left(x))[1]
             if moved is not None:  # x' = A⁻¹ (b' − A' x)
@@ -209,19 +213,18 @@ def krylov(
 ) -> tuple[Tensor, TransportSolveReport]:
     """Solve A x = b, (B, nx, ny, nz), in float64, one system per colony, each until it converges.
 
-    The residual is at most TOLERANCE of b, or its `rounding` (B or 1,) of x. inverse: of the
-    diagonal of A. No gradient.
+    The residual is at most TOLERANCE of b, or its `rounding`, of the shape of b or of one, of x.
+    inverse: of the diagonal of A. No gradient.
     """
     most = torch.maximum(b.abs(), start.abs()).amax((1, 2, 3), keepdim=True)
     up = torch.ones_like(most).masked_fill((most > 0) & (most < SMALL), LARGER)
     b, start = b * up, start * up
     size = _dot(b, b)
-    least = rounding.reshape(-1, 1, 1, 1) ** 2
     x, iterations = start.clone(), torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
     # restarts from the true residual correct the rounding errors of the recurred one
     for _ in range(3):
         r = b - apply(x)
-        target = torch.maximum(TOLERANCE**2 * size, least * _dot(x, x))
+        target = torch.maximum(TOLERANCE**2 * size, _dot(rounding * x, rounding * x))
         going = _dot(r, r) > target
         if not bool(going.any()):
             break
@@ -229,7 +232,7 @@ def krylov(
         x, spent = method(apply, x, r, inverse, going, target)
         iterations += spent
     r = b - apply(x)
-    target = torch.maximum(TOLERANCE**2 * size, least * _dot(x, x))
+    target = torch.maximum(TOLERANCE**2 * size, _dot(rounding * x, rounding * x))
     residual = _ratio(_dot(r, r), size).sqrt().reshape(-1)
     # a right-hand side of zero has the solution zero; a NaN never converges
     return x / up, TransportSolveReport(
