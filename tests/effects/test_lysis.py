@@ -290,6 +290,22 @@ def test_volumes_amounts_and_several_species(device, dtype):
         assert found.tolist() == pytest.approx([amount] * 2, rel=1e-6)
 
 
+def test_how_much_of_what_a_cell_holds_is_released(device, dtype):
+    """A number, one per type, and a distribution drawn at birth."""
+    given = {"volume": {0: 2.0, 1: 0.5}, "toxin": 0.25, "store": tf.Uniform(1.0, 2.0)}
+    scene = tf.Scene(
+        holding(amount=4.0), tf.Rules(lambda c: None, variables={"store": 3.0}),
+        tf.Lysis(when="toxin", releases={"food": given}), medium("food", "toxin"),
+        founders=tf.Cells(FOUR.position, FOUR.axis, length=2.0, cell_type=[0, 0, 0, 1]),
+    )  # fmt: skip
+    start = scene.bind(2, device=device, dtype=dtype).start()
+    volume = float(start.volume[0].double())
+    drawn = start.groups.sum(start.fields["lysis_releases_food_store"].double())
+    wanted = 6.5 * volume + 0.25 * 4.0 * 4 * volume + 3.0 * drawn
+    found = totals(step(scene, start, 0.1), "food", inside=False)
+    assert found.tolist() == pytest.approx(wanted.tolist(), rel=1e-6)
+
+
 def test_variables_are_amounts_and_bursts_are_drawn():
     """A variable of rules is an amount; a drawn one is each cell's own, and kept from its birth."""
     cells = tf.Cells(FOUR.position, FOUR.axis, extra={"phages": [5.0, 6.0, 7.0, 8.0]})
@@ -402,8 +418,14 @@ def test_a_search_grows_each_design_anew():
         ({"when": "toxin", "releases": ["toxin"]}, "a dict of what goes to each signal"),
         ({"when": "toxin", "releases": {"a b": "toxin"}}, "keys that name signals"),
         ({"when": "toxin", "releases": {"toxin": ()}}, r"releases\['toxin'\] = \(\) is not"),
-        ({"when": "toxin", "releases": {"toxin": "2 + 2"}}, "a tuple of names, or an amount"),
+        ({"when": "toxin", "releases": {"toxin": "2 + 2"}}, "a dict of how much of each, or an amount"),
         ({"when": "toxin", "releases": {"toxin": -5.0}}, r"releases\['toxin'\]"),
+        ({"when": "toxin", "releases": {"toxin": {"toxin": -1.0}}}, r"\['toxin'\]\['toxin'\] = -1"),
+        ({"when": "toxin", "releases": {"toxin": {"length": 1.0}}}, "of a cell's shape"),
+        (
+            {"when": "toxin", "releases": {"toxin": {"a": 1.0, 0: 1.0}}},
+            "a dict of how much of each",
+        ),
     ],
 )
 def test_bad_input(given, words):

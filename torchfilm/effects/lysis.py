@@ -22,6 +22,7 @@ from torchfilm.tools.row_checks import check_names, check_variable, is_name
 from torchfilm.values import CONCENTRATION, Rule, Value, checked, physical
 
 AMOUNT = Rule("conc·µm³", least=0.0, scheduled=True)
+SHARE = Rule("", least=0.0, scheduled=True)
 LENGTH, VOLUME = "length", "volume"
 SUMS = (CONCENTRATION, "")  # units of species and variables, which may add up a hazard
 _NO_LEVELS = ("radius", "position", "axis", "area", "cells")
@@ -79,8 +80,9 @@ class Lysis(Effect):
     releases: what goes to each signal of the Medium, by the signal's name: the name of a species
     (its concentration times the cell's volume is released) or of a variable of rules (its value, an
     amount in conc·µm³), "volume" (one unit of concentration times the volume), a tuple of such
-    names, or an amount per cell in conc·µm³, given as `rate` is. What it does not name is lost with
-    the cell; `explain` lists the species that are.
+    names, a dict of how much of each, such as {"volume": 2.0, "gfp": 1.0}, or an amount per cell
+    in conc·µm³, given as `rate` is. What it does not name is lost with the cell; `explain` lists
+    the species that are.
 
     The lineage keeps the end of these cells, with the fate "lysed"; `state.reports["lysis"]` counts
     them. Transport spreads what they released from the next step on.
@@ -134,20 +136,27 @@ class Lysis(Effect):
         object.__setattr__(self, "releases", read_only({s: given[s] for s in sorted(given)}))
 
     def _checked_release(self, signal: object, what: Any) -> Any:
-        """A tuple of names, or a checked amount."""
+        """A tuple of names, a dict of how much of each, or a checked amount."""
         path = f"Lysis.releases[{signal!r}]"
         if not is_name(signal):
             raise checks.input_error("Lysis.releases", signal, "keys that name signals")
-        names = tuple(what) if isinstance(what, tuple | list) else (what,)
+        shares = isinstance(what, Mapping) and any(isinstance(n, str) for n in what)
+        names = tuple(what) if isinstance(what, tuple | list) or shares else (what,)
         if names and all(map(is_name, names)):
             if {LENGTH, *_NO_LEVELS} & {*names}:
                 raise checks.input_error(path, what, _OF_SHAPE)
             if len(set(names)) < len(names):
                 raise checks.input_error(path, what, "a tuple of different names")
+            if shares:
+                each = {n: checked(f"{path}[{n!r}]", x, SHARE) for n, x in what.items()}
+                return read_only(each)
             return names
         if isinstance(what, str) or not names or any(isinstance(n, str) for n in names):
             raise checks.input_error(
-                path, what, 'the name of a species, "volume", a tuple of names, or an amount'
+                path,
+                what,
+                'the name of a species, "volume", a tuple of names, a dict of how much of each, or'
+                " an amount",
             )
         return checked(path, what, AMOUNT)
 
@@ -155,7 +164,7 @@ class Lysis(Effect):
     def _named(self) -> dict[str, tuple[str, ...]]:
         """What each signal gets of the cell, by the signal's name."""
         assert self.releases is not None
-        return {s: what for s, what in self.releases.items() if isinstance(what, tuple)}
+        return {s: tuple(what) for s, what in self.releases.items() if _is_named(what)}
 
     def at_least_zero(self) -> tuple[str, ...]:
         released = (n for names in self._named.values() for n in names if n != VOLUME)
@@ -168,12 +177,13 @@ class Lysis(Effect):
 
     def physical_values(self) -> dict[str, tuple[Any, Rule]]:
         assert self.releases is not None
-        amounts = {
-            f"releases[{s}]": (x, AMOUNT)
-            for s, x in self.releases.items()
-            if not isinstance(x, tuple)
-        }
-        return {**self.physical_fields(), **amounts}
+        found = dict(self.physical_fields())
+        for s, what in self.releases.items():
+            if not _is_named(what):
+                found[f"releases[{s}]"] = (what, AMOUNT)
+            elif isinstance(what, Mapping):
+                found |= {f"releases[{s}][{n}]": (x, SHARE) for n, x in what.items()}
+        return found
 
     def reads(self) -> tuple[str, ...]:
         sized = self.releases or self.when in (LENGTH, VOLUME)
@@ -313,12 +323,22 @@ class BoundLysis(BoundEffect):
 
     def _amount(self, state: State, signal: str, what: Any) -> Tensor:
         """What a cell that bursts releases to a signal, conc·µm³, (N,) or one number."""
-        if not isinstance(what, tuple):
+        if not _is_named(what):
             return self.values[f"releases[{signal}]"].of_cells(state)
         held = [
             _quantity(state, n) * (state.volume if _is_species(state, n) else 1.0) for n in what
         ]
+        if isinstance(what, Mapping):
+            shares = (self.values[f"releases[{signal}][{n}]"].of_cells(state) for n in what)
+            held = [x * share for x, share in zip(held, shares, strict=True)]
         return functools.reduce(torch.add, held)  # in this order, whatever the batch
+
+
+def _is_named(what: Any) -> bool:
+    """Whether a release is of what a cell holds, and not an amount."""
+    return isinstance(what, tuple) or (
+        isinstance(what, Mapping) and any(isinstance(n, str) for n in what)
+    )
 
 
 def _quantity(state: State, name: str) -> Tensor:
