@@ -159,6 +159,7 @@ class Front:
             self.goals,
             colonies,
             self.convergence(),
+            self.seeds,
         )
         return tf.pictures.Picture(figure, out)
 

@@ -22,17 +22,21 @@ def draw_front(
     front: np.ndarray,
     colonies: dict[int, list[FinishedColonies]],
     course: tuple[np.ndarray, np.ndarray],
+    fresh: int,
 ) -> Figure:
     """Draw the first two goals of all designs (n, G) and of the front (F, G), a colony of some of
-    its designs, by row, and the hypervolume against colonies simulated."""
+    its designs, by row, and the hypervolume against colonies simulated. fresh: the number of seeds
+    on which those of the front were measured again, 0 where they are those of the search."""
     columns = max(2, len(colonies))
     figure = tf.pictures.new_figure(2.6 * columns, 6.4)
     grid = figure.add_gridspec(2, columns, height_ratios=[1.0, 0.8])
     ax = figure.add_subplot(grid[0, : max(1, (2 * columns) // 3)])
-    ax.plot(every[:, 0], every[:, 1], ".", color="0.75", ms=3, label="every design")
+    ax.plot(every[:, 0], every[:, 1], ".", color="0.75", ms=3,
+            label="every design" + ", on the seeds of the search" * bool(fresh))  # fmt: skip
     if front.shape[1] == 2:  # no design lies between two neighbours: a step, not a slope
         ax.step(front[:, 0], front[:, 1], where="post", color="C3", lw=0.8, zorder=1)
-    ax.plot(front[:, 0], front[:, 1], "D", color="C3", ms=4, label="front")
+    ax.plot(front[:, 0], front[:, 1], "D", color="C3", ms=4,
+            label="front" + f", on {fresh} fresh seeds" * bool(fresh))  # fmt: skip
     for row in colonies:
         ax.annotate(
             str(row),

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 SHOWN = 3  # replicates side by side, or one under so many conditions
 MOST_SHOWN = 6
+LETTERS, OPTION = 34, 10  # that are shown of a parameter, and of an option
 # losses of which the largest is so many times the smallest are drawn by their logarithms
 WIDE = 100.0
 
@@ -102,18 +103,19 @@ def _extent(cells: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _colour(name: str, place: int) -> str:
-    """The colour of a species: the one that its name states, or one of a list."""
+    """The colour of a species: the one that its name states, or one of a list. Red light is shown
+    as magenta, which colour-blind readers tell from green."""
     known = {
         "cfp": "cyan",
         "gfp": "lime",
         "yfp": "yellow",
-        "rfp": "red",
+        "rfp": "magenta",
         "blue": "dodgerblue",
         "white": "white",
-        "red": "red",
+        "red": "magenta",
         "green": "lime",
     }
-    return known.get(name.lower(), ("yellow", "cyan", "magenta", "red", "lime", "white")[place % 6])
+    return known.get(name.lower(), ("yellow", "cyan", "magenta", "lime", "white", "red")[place % 6])
 
 
 def _shown(target: Target, grown: list[FinishedColonies]) -> list[str]:
@@ -228,8 +230,13 @@ def _draw_parameters(ax: Axes, report: SearchReport) -> None:
         low, high = (
             (f"{p.low:g}", f"{p.high:g}")
             if isinstance(p, Parameter)
-            else (str(p.options[0]), str(p.options[-1]))
+            else tuple(tf.displays.shortened(str(p.options[k]), OPTION) for k in (0, -1))
         )
+        ax.annotate(
+            tf.displays.shortened(f"{p.name} = {show_value(best.values[p.name])}", LETTERS), (0, y),
+            xytext=(-4, 6), textcoords="offset points", va="bottom", fontsize=8,
+            annotation_clip=False, parse_math=False,
+        )  # fmt: skip
         for x, bound, side in ((0, low, "right"), (1, high, "left")):
             ax.annotate(
                 bound,
@@ -241,14 +248,8 @@ def _draw_parameters(ax: Axes, report: SearchReport) -> None:
                 fontsize=7,
                 color="0.4",
             )
-    ax.set(
-        yticks=rows,
-        yticklabels=[f"{p.name} = {show_value(best.values[p.name])}" for p in space.parameters],
-        xticks=[],
-        xlim=(-0.28, 1.28),
-    )
-    ax.set_ylim(-0.7, space.size - 0.3)
-    ax.tick_params(left=False)
+    ax.set(yticks=[], xticks=[], xlim=(-0.28, 1.28))
+    ax.set_ylim(-0.7, space.size - 0.1)
     for side in ("left", "right", "top", "bottom"):
         ax.spines[side].set_visible(False)
     ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=2, frameon=False)

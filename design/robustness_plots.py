@@ -7,8 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+import torchfilm as tf
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+LETTERS = 24  # that are shown of a parameter
 
 
 def draw_losses(
@@ -24,10 +28,12 @@ def draw_losses(
         ax.axhline(threshold, color="0.6", lw=0.8, ls=":")
     ax.set(
         xticks=range(len(columns)),
-        xticklabels=[name for name, _ in columns],
+        xticklabels=[tf.displays.shortened(name, LETTERS) for name, _ in columns],
         ylabel="loss",
         ylim=(0, None),
     )
+    if len(columns) > 3:
+        ax.tick_params(axis="x", labelrotation=25, labelsize=8)
     ax.set_title("each seed, and the median", fontsize=9)
 
 
@@ -42,7 +48,11 @@ def draw_changes(ax: Axes, rows: Sequence[tuple[str, float, float]]) -> None:
         ecolor="0.3",
     )
     ax.axvline(0, color="black", lw=0.8)
-    ax.set(yticks=places, yticklabels=[label for label, *_ in rows], xlabel="change of the loss")
+    ax.set(
+        yticks=places,
+        yticklabels=[tf.displays.shortened(label, LETTERS) for label, *_ in rows],
+        xlabel="change of the loss",
+    )
     ax.set_title("one parameter changed", fontsize=9)
 
 
@@ -56,7 +66,8 @@ def draw_indices(
     places = np.arange(len(names))[::-1]
     for shift, (index, error), label in ((0.2, first, "alone"), (-0.2, total, "with others")):
         ax.barh(places + shift, index, 0.38, xerr=error, label=label, ecolor="0.3")
-    ax.set(yticks=places, yticklabels=names, xlabel="share of the loss's variance")
+    short = [tf.displays.shortened(name, LETTERS) for name in names]
+    ax.set(yticks=places, yticklabels=short, xlabel="share of the loss's variance")
     ax.axvline(0, color="black", lw=0.8)
     ax.legend(fontsize=7, frameon=False)
     ax.set_title("which parameters matter", fontsize=9)

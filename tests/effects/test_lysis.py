@@ -418,7 +418,10 @@ def test_a_search_grows_each_design_anew():
         ({"when": "toxin", "releases": ["toxin"]}, "a dict of what goes to each signal"),
         ({"when": "toxin", "releases": {"a b": "toxin"}}, "keys that name signals"),
         ({"when": "toxin", "releases": {"toxin": ()}}, r"releases\['toxin'\] = \(\) is not"),
-        ({"when": "toxin", "releases": {"toxin": "2 + 2"}}, "a dict of how much of each, or an amount"),
+        (
+            {"when": "toxin", "releases": {"toxin": "2 + 2"}},
+            "a dict of how much of each, or an amount",
+        ),
         ({"when": "toxin", "releases": {"toxin": -5.0}}, r"releases\['toxin'\]"),
         ({"when": "toxin", "releases": {"toxin": {"toxin": -1.0}}}, r"\['toxin'\]\['toxin'\] = -1"),
         ({"when": "toxin", "releases": {"toxin": {"length": 1.0}}}, "of a cell's shape"),

@@ -12,6 +12,8 @@
                           after one another, frames as in /cells
     /signals_at_cells/NAME  scenes with a medium only: one row per cell, as in /cells: the
                           concentration that the cell finds
+    /obstacles            scenes with obstacles only: 1 in the voxels of the first frame in which no
+                          signal can be, for pictures
     /parameters/PATH      (B,), parameters with one value per colony: see `torchfilm.io.parameters`
     /lineage/births       colony_id, uid, parent, step, length
     /lineage/ends         colony_id, uid, step, fate, length
@@ -40,6 +42,7 @@ from torchfilm.state import CELL, COLONY, PER_CELL, State
 
 FORMAT, VERSION = "torchfilm results", 3
 AT_CELLS = "signals_at_cells"
+OBSTACLES = "obstacles"
 # Internal fields of files that do not name theirs, as earlier versions wrote them.
 INTERNAL_BEFORE = (
     "collapsed_steps",
@@ -184,6 +187,9 @@ def create_tables(file: h5py.File, state: State) -> None:
     if state.layout is not None:
         file.attrs["spacing"] = state.layout.grid.spacing
         file.attrs["height"] = state.layout.height
+        if state.layout.mask is not None:
+            solid = numpy_of(~state.layout.mask).astype(np.int8)
+            file.create_dataset(OBSTACLES, data=solid, compression="gzip")
         for name, value in voxel_columns(state).items():
             chunk = voxels_per_chunk(len(value))
             create_framed(file, f"signals/{name}", value.dtype, (), chunk)

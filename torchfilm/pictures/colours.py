@@ -21,9 +21,19 @@ CELLS, MEAN = "cells", "mean"
 # The darkest cell colour is not black, so that cells are visible on black. Missing values are grey.
 FLOOR, NO_VALUE = 0.14, (0.55, 0.55, 0.55, 1.0)
 # An integer quantity with at most this many values is a category. These are the colours of 0, 1, …
-# (of Okabe and Ito, distinct for colour-blind readers): a type keeps its colour where others die.
-KINDS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#8C6BB1")
-GOLDEN = 0.618034  # of a turn, from one hue to the next: none comes near those before it
+# (of Okabe and Ito, and one of Tol, distinct for colour-blind readers): a type keeps its colour
+# where others die. Types of cells are categories up to MOST_TYPES.
+KINDS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#661100")
+TYPES, MOST_TYPES = "cell_type", 24
+GOLDEN = 0.618034  # of a turn, from one hue to the next
+APART = 0.45  # the least distance between two categories, as red, green and blue
+# Angles of 0, 15, … 165°. In CIELAB L = 58 + 22 sin t, a = 25 sin t and b = −35 cos t, t twice the
+# angle: lightness and blue–yellow tell directions apart without red and green, where a circle of
+# hues has pairs that look alike.
+WHEEL = (
+    "#5d8ec8", "#a2a3df", "#d8b2df", "#f4b6c7", "#f0af9f", "#d09f72", "#9f8a4d", "#6c743b",
+    "#40643e", "#145f54", "#006677", "#0078a2",
+)  # fmt: skip
 
 # The least range of colours of a concentration, relative to its largest value.
 NARROWEST = 0.01
@@ -62,6 +72,7 @@ class PlotStyle:
         from matplotlib.colors import is_color_like
 
         checks.choice("view", self.view, tuple(VIEWS))
+        checks.choice("whole", self.whole, (True, False))
         for name in ("colour", "background"):
             given = getattr(self, name)
             if given is not None and not isinstance(given, str):
@@ -99,11 +110,9 @@ class PlotStyle:
             rule = f'ranges by name of a drawn quantity, such as {{"{name}": (0, 2)}}'
             raise checks.input_error("limits", self.limits, rule)
         for name, pair in (self.limits or {}).items():
-            low, high = checks.vector(f"limits[{name!r}]", pair, 2)
-            if low >= high:
-                raise checks.input_error(
-                    f"limits[{name!r}]", (low, high), "two numbers, the first below the second"
-                )
+            checked_range(f"limits[{name!r}]", pair)
+            if name == ANGLE:
+                raise checks.input_error("limits", name, "left out: its range is 0 to 180°")
             if name not in (*self.quantities, self.background, self.signal):
                 drawn = (
                     ", ".join(
@@ -166,12 +175,20 @@ class PlotStyle:
                 raise checks.input_error(what, name, rule + ", ".join(listed), hint)
 
 
+def checked_range(name: str, pair: object) -> tuple[float, float]:
+    """The ends of a range of colours. Raises InputError for what is none."""
+    low, high = checks.vector(name, pair, 2)
+    if low >= high:
+        raise checks.input_error(name, (low, high), "two numbers, the first below the second")
+    return low, high
+
+
 def default_colour(frame: Frame) -> str:
     """What shows most of a scene: the types of cells, where there are several; else the first
     species of its circuits; else the angle."""
-    types = frame.cells.get("cell_type")
+    types = frame.cells.get(TYPES)
     if types is not None and len(np.unique(types)) > 1:
-        return "cell_type"
+        return TYPES
     species = (n for n, unit in frame.units.items() if unit == CONCENTRATION and n in frame.cells)
     return next(species, ANGLE)
 
@@ -199,9 +216,10 @@ def values_of(cells: Mapping[str, np.ndarray], name: str, view: str) -> np.ndarr
 class ValueRange:
     """The range of one quantity so far: lowest and highest value.
 
-    kinds: the distinct values while they are integers and few, else None.
+    kinds: the distinct values while they are integers and at most `most`, else None.
     """
 
+    most: int = len(KINDS)
     low: float = math.inf
     high: float = -math.inf
     kinds: set[int] | None = field(default_factory=set)
@@ -211,11 +229,9 @@ class ValueRange:
         if self.kinds is not None:
             whole = values.dtype == bool or np.issubdtype(values.dtype, np.integer)
             self.kinds = (
-                self.kinds | {int(x) for x in np.unique(values)[: len(KINDS) + 1]}
-                if whole
-                else None
+                self.kinds | {int(x) for x in np.unique(values)[: self.most + 1]} if whole else None
             )
-            if self.kinds is not None and len(self.kinds) > len(KINDS):
+            if self.kinds is not None and len(self.kinds) > self.most:
                 self.kinds = None
         finite = values[np.isfinite(values)]
         if finite.size:
@@ -282,7 +298,7 @@ def scale_of(
             name,
             label,
             unit,
-            ListedColormap([_colour_of_kind(k) for k in sorted(seen.kinds)]),
+            ListedColormap(_colours_of_kinds(sorted(seen.kinds), name == TYPES)),
             (0.0, 1.0),
             kinds=tuple(sorted(seen.kinds)),
         )
@@ -295,13 +311,35 @@ def scale_of(
     return Scale(name, label, unit, _colour_map(name, style), limits, beyond)
 
 
-def _colour_of_kind(kind: int) -> Any:
-    """The colour of a category, by its number alone; beyond the list hues far apart."""
-    from matplotlib.colors import hsv_to_rgb
+def range_of(name: str) -> ValueRange:
+    """The range of a quantity of which nothing is known yet."""
+    return ValueRange(MOST_TYPES if name == TYPES else len(KINDS))
 
-    if 0 <= kind < len(KINDS):
-        return KINDS[kind]
-    return tuple(hsv_to_rgb((kind * GOLDEN % 1.0, 0.6, (0.9, 0.6)[kind % 2])))
+
+def _colours_of_kinds(kinds: Sequence[int], keep: bool = False) -> list[Any]:
+    """The colours of categories, by their numbers; beyond the list hues that are apart from those
+    before. keep: each number has one colour, whatever else there is."""
+    if keep:
+        known = _colours_of_kinds(range(MOST_TYPES))
+        each = (known[k] if 0 <= k < MOST_TYPES else _colour_of_kind(k, 0) for k in kinds)
+        return list(each)
+    found: list[Any] = []
+    for kind in kinds:
+        made = [_colour_of_kind(kind, k) for k in range(12)]
+        far = [min((math.dist(c, x) for x in found), default=1.0) for c in made]
+        found.append(next((c for c, x in zip(made, far, strict=True) if x >= APART),
+                          made[int(np.argmax(far))]))  # fmt: skip
+    return found
+
+
+def _colour_of_kind(kind: int, turns: int) -> tuple[float, ...]:
+    """The colour of a category, by its number alone, or another one, so many hues further."""
+    from matplotlib.colors import hsv_to_rgb, to_rgb
+
+    if 0 <= kind < len(KINDS) and not turns:
+        return to_rgb(KINDS[kind])
+    hue = (kind * GOLDEN + turns / 12) % 1.0
+    return tuple(hsv_to_rgb((hue, 0.6, (0.9, 0.6)[kind % 2])).tolist())
 
 
 def _wide_enough(low: float, high: float, share: float) -> tuple[float, float]:
@@ -333,14 +371,10 @@ def _colour_map(name: str, style: PlotStyle) -> Any:
 
 
 def _wheel() -> Any:
-    """A cyclic colour map of even, muted colours.
+    """A cyclic colour map. One through white or black would hide cells of one direction."""
+    from matplotlib.colors import LinearSegmentedColormap
 
-    A map through white or black would hide cells of one direction.
-    """
-    from matplotlib.colors import ListedColormap, hsv_to_rgb
-
-    hue = np.linspace(0, 1, 256, endpoint=False)
-    return ListedColormap(hsv_to_rgb(np.stack([hue, np.full(256, 0.55), np.full(256, 0.85)], 1)))
+    return LinearSegmentedColormap.from_list(ANGLE, [*WHEEL, WHEEL[0]])
 
 
 def light(colour: str) -> np.ndarray:

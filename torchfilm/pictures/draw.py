@@ -16,6 +16,7 @@ from torchfilm.pictures.colours import (
     ValueRange,
     is_rgb,
     paint_cells,
+    range_of,
     scale_of,
     values_of,
 )
@@ -30,6 +31,7 @@ WALL = "#a0522d"  # not grey, so that it differs from a signal
 FAR = 1e6  # µm: the end of a wall that has none
 # the colour outside the box of a signal: not grey, so that nobody reads it as a concentration
 OUTSIDE_BOX = "#efe4d2"
+OBSTACLE = "#d2b48c"
 SMALL, TINY = 7.0, 6.0  # points
 ROUND = 0.1  # inches per µm above which an outline of few points has visible corners
 
@@ -49,6 +51,10 @@ def draw_cells(
     colour, channels, limits, view: as for `show`; the default range is that of these cells. window:
     the range of the axes; default all cells.
     """
+    _check_axes(ax)
+    if not isinstance(cells, Mapping):
+        hint = "Such as those of one colony: tf.Results(path).frame(-1), or Frame.colony(0)."
+        raise checks.input_error("cells", type(cells).__name__, "columns of cells by name", hint)
     style = PlotStyle(colour=colour, channels=channels, limits=limits, view=view)
     scales = []
     for name in style.quantities:
@@ -60,7 +66,7 @@ def draw_cells(
                 name,
                 "'angle' or one of " + ", ".join(n for n in cells if cells[n].ndim == 1),
             )
-        seen = ValueRange()
+        seen = range_of(name)
         seen.add(cells[name] if name in cells else values_of(cells, name, view))
         scales.append(scale_of(name, seen, style, {}))
     covered = span(cells, view)
@@ -73,9 +79,19 @@ def draw_cells(
             covered[1, 1] + pad,
         )
     if window is not None:
-        set_window(ax, window)
+        left, right, bottom, top = checks.vector("window", window, 4)
+        set_window(ax, (left, right, bottom, top))
     add_cells(ax, cells, scales, style)
     return scales
+
+
+def _check_axes(ax: object) -> None:
+    """Raise InputError for what are no axes of matplotlib."""
+    from matplotlib.axes import Axes
+
+    if not isinstance(ax, Axes):
+        hint = "Such as those of fig, ax = plt.subplots()."
+        raise checks.input_error("ax", type(ax).__name__, "axes of matplotlib", hint)
 
 
 def draw_signal(
@@ -96,6 +112,9 @@ def draw_signal(
     "mean" for its mean along it. limits: the range from white to black; default the range of the
     drawn values.
     """
+    _check_axes(ax)
+    if np.ndim(values) != 3:
+        raise checks.input_error("values", f"of shape {np.shape(values)}", "of shape (nx, ny, nz)")
     style = PlotStyle(
         background=name,
         view=view,
@@ -156,6 +175,27 @@ def add_signal(ax: Axes, flat: np.ndarray, extent: Window, scale: Scale) -> None
         interpolation="bilinear",
         zorder=0,
     )
+    set_window(ax, window)
+
+
+def add_obstacles(ax: Axes, solid: np.ndarray, extent: Window) -> None:
+    """Draw where there is no medium, (nu, nv) bool, with an outline as of hard walls."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import to_rgba
+
+    window = (*ax.get_xlim(), *ax.get_ylim())
+    colours = np.zeros((*solid.shape, 4))
+    colours[solid] = to_rgba(OBSTACLE)
+    ax.imshow(colours.transpose(1, 0, 2), origin="lower", extent=extent, interpolation="nearest",
+              zorder=0.3)  # fmt: skip
+    left, right, bottom, top = extent
+    du, dv = (right - left) / solid.shape[0], (top - bottom) / solid.shape[1]
+    corner = lambda k, j: (left + k * du, bottom + j * dv)
+    across = np.argwhere(solid[1:] != solid[:-1])
+    along_u = np.argwhere(solid[:, 1:] != solid[:, :-1])
+    lines = [(corner(k + 1, j), corner(k + 1, j + 1)) for k, j in across]
+    lines += [(corner(k, j + 1), corner(k + 1, j + 1)) for k, j in along_u]
+    ax.add_collection(LineCollection(lines, colors=WALL, linewidths=0.8, zorder=0.4), autolim=False)
     set_window(ax, window)
 
 
@@ -258,19 +298,21 @@ def _ends(
 
 
 def scale_bar(ax: Axes) -> float:
-    """A bar of a round length just below the axes, at the left, where it hides nothing.
+    """A bar of a round length just below the axes, at the left, where it hides nothing. It keeps
+    to its length where the limits or the size of the axes change.
 
     Returns its length, µm.
     """
     from matplotlib.transforms import ScaledTranslation
 
+    _check_axes(ax)
     low, high = sorted(ax.get_xlim())
     rough = 0.3 * (high - low)
-    size = max(s for e in range(-2, 6) for s in (10.0**e, 2 * 10.0**e, 5 * 10.0**e) if s <= rough)
+    power = math.floor(math.log10(rough))
+    size = max(s for s in (10.0**power, 2 * 10.0**power, 5 * 10.0**power) if s <= rough)
     # in units of the axes, so that the bar moves with them
     below = ax.transAxes + ScaledTranslation(0, -5 / 72, ax.figure.dpi_scale_trans)
-    share = size / (high - low)
-    ax.add_line(_line([0, share], below))
+    ax.add_line(_bar(ax, size, below))
     ax.annotate(
         f"{size:g} µm",
         (0, 0),
@@ -284,18 +326,22 @@ def scale_bar(ax: Axes) -> float:
     return size
 
 
-def _line(x: list[float], transform: Any) -> Any:
+def _bar(ax: Axes, size: float, transform: Any) -> Any:
+    """A line of so many µm of the axes, from their left end, whenever it is drawn."""
+    from matplotlib import rcParams
     from matplotlib.lines import Line2D
 
-    return Line2D(
-        x,
-        [0, 0],
-        transform=transform,
-        color="black",
-        linewidth=2.0,
-        solid_capstyle="butt",
-        clip_on=False,
-    )
+    class Bar(Line2D):
+        def draw(self, renderer: Any) -> None:
+            low, high = sorted(ax.get_xlim())
+            self.set_xdata([0, size / (high - low)])
+            super().draw(renderer)
+
+    low, high = sorted(ax.get_xlim())
+    return Bar(
+        [0, size / (high - low)], [0, 0], transform=transform, color=rcParams["text.color"],
+        linewidth=2.0, solid_capstyle="butt", clip_on=False,
+    )  # fmt: skip
 
 
 def colour_bar(ax: Axes, scale: Scale) -> None:
@@ -326,7 +372,7 @@ def colour_bar(ax: Axes, scale: Scale) -> None:
     bar.minorticks_off()
     bar.outline.set_linewidth(0.4)  # type: ignore[operator]
     ax.tick_params(labelsize=TINY, length=2, width=0.4, pad=1.5)
-    ax.set_title(scale.title, fontsize=SMALL, pad=3)
+    ax.set_title(scale.title, fontsize=SMALL, pad=3, parse_math=False)
 
 
 def numbers(values: np.ndarray) -> list[str]:

@@ -359,6 +359,8 @@ def opened(what: object) -> Iterator[Results]:
             yield results
     else:
         hint = "A state is drawn by tf.show(state)."
+        if isinstance(what, Scene):
+            hint = "Run the scene; its founders are tf.show(scene.bind().start(), scene=scene)."
         raise checks.input_error("results", what, "a results file, or its path", hint)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from torchfilm.io.identity import walls_of
+from torchfilm.io.layout import OBSTACLES
 from torchfilm.io.parameters import column_names
 from torchfilm.io.results import Results
 from torchfilm.scene import Scene
@@ -29,7 +30,8 @@ class Frame:
     ny, nz) per colony, on grids with lower corners `origin` (B, 3) and `spacing` (3,), µm. height:
     z of the plane of 2-D cells, µm, if known. walls: as in `Results.walls`. faces: of a periodic
     space, (low, high) µm by axis. internal: the quantities that serve the numerics, which messages
-    do not list. names: of the colonies, (B,), for titles; by default their ids.
+    do not list. names: of the colonies, (B,), for titles; by default their ids. solid: where the
+    obstacles of a medium are, one array (nx, ny, nz) bool per colony; empty without them.
     """
 
     cells: Mapping[str, np.ndarray]
@@ -45,6 +47,7 @@ class Frame:
     faces: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     internal: Collection[str] = ()
     names: Sequence[str] | None = None
+    solid: Sequence[np.ndarray] = ()
 
     def name(self, place: int) -> str:
         """What a title calls the colony at this index of the batch."""
@@ -83,14 +86,8 @@ def frame_of(state: State, scene: Scene | None = None) -> Frame:
     if state.layout is None:
         return Frame(cells, state.time, ids, units, walls=walls, faces=faces, internal=internal)
     grid = state.layout.grid
-    cuts = grid.offsets.cpu().numpy()[1:-1]
-    signals = {
-        n: [
-            x.reshape(s)
-            for x, s in zip(np.split(v.detach().cpu().numpy(), cuts), grid.shapes, strict=True)
-        ]
-        for n, v in state.signals.items()
-    }
+    shapes, mask = grid.shape.cpu().numpy(), state.layout.mask
+    signals = {n: _parted(v.detach().cpu().numpy(), shapes) for n, v in state.signals.items()}
     return Frame(
         cells,
         state.time,
@@ -104,7 +101,14 @@ def frame_of(state: State, scene: Scene | None = None) -> Frame:
         walls,
         faces,
         internal,
+        solid=() if mask is None else _parted(~mask.cpu().numpy(), shapes),
     )
+
+
+def _parted(values: np.ndarray, shapes: np.ndarray) -> list[np.ndarray]:
+    """(voxels,) as one array for each colony."""
+    cuts = np.cumsum(shapes.prod(1))[:-1]
+    return [x.reshape(s) for x, s in zip(np.split(values, cuts), shapes, strict=True)]
 
 
 class RecordedFrames(Sequence[Frame]):
@@ -163,6 +167,7 @@ class RecordedFrames(Sequence[Frame]):
             self.faces,
             results.internal_fields,
             _named(results.parameters(place)),
+            _solid(results, shape),
         )
 
     def __iter__(self) -> Iterator[Frame]:
@@ -183,6 +188,15 @@ class RecordedFrames(Sequence[Frame]):
     def title(self) -> str:
         """The name of the scene."""
         return str(self.results.attributes["scene"]).splitlines()[0].split(":")[0]
+
+
+def _solid(results: Results, shape: np.ndarray) -> Sequence[np.ndarray]:
+    """Where obstacles are in grids of these shapes (B, 3); nothing where the file does not say, as
+    of a box that has grown."""
+    kept = results.file.get(OBSTACLES)
+    if kept is None or kept.shape != (shape.prod(1).sum(),):
+        return ()
+    return _parted(kept[...].astype(bool), shape)
 
 
 def _named(parameters: Mapping[str, np.ndarray]) -> list[str] | None:

@@ -16,14 +16,15 @@ from torchfilm.pictures.colours import (
     MEAN,
     PlotStyle,
     Scale,
-    ValueRange,
     default_colour,
     is_rgb,
+    range_of,
     scale_of,
 )
 from torchfilm.pictures.draw import (
     add_cells,
     add_faces,
+    add_obstacles,
     add_signal,
     add_walls,
     colour_bar,
@@ -45,6 +46,7 @@ EDGE, GAP, HEAD = 0.12, 0.07, 0.19  # margin, between panels, title of a panel
 # height of a legend with its ticks; of the scale bar; between two legends, for their end numbers
 BAR, BELOW, ROOM = 0.36, 0.24, 0.45
 LETTER = 0.056  # width of a letter of 7 points, about
+MOST_DPI = 2400.0
 TOGETHER = 0.1  # how much larger a window of all colonies may be, as a share of its size
 
 
@@ -86,7 +88,7 @@ def plan_layout(frames: Sequence[Frame], places: Sequence[int], style: PlotStyle
     if style.colour is None and style.channels is None:
         style = replace(style, colour=default_colour(frames[0]))
     seen = {
-        name: ValueRange()
+        name: range_of(name)
         for name in (*style.quantities, *([style.signal] if style.signal else []))
     }
     coloured: set[str] = set()  # quantities that are colours themselves
@@ -187,6 +189,19 @@ def signal_section(
     )
 
 
+def solid_section(
+    frame: Frame, place: int, style: PlotStyle, cells: Mapping[str, np.ndarray]
+) -> np.ndarray | None:
+    """Where obstacles are in the view of one colony, (nu, nv) bool: at the section of the signal,
+    and for a mean where the whole line of sight is solid. None without obstacles."""
+    if not frame.solid:
+        return None
+    assert frame.origin is not None and frame.spacing is not None
+    height = _height(frame, place, style, cells) if style.section == CELLS else None
+    whole = frame.solid[place].astype(float)
+    return cut(whole, frame.origin[place], frame.spacing, style, height) > 0.999
+
+
 def _height(frame: Frame, place: int, style: PlotStyle, cells: Mapping[str, np.ndarray]) -> float:
     """The position of cells along the line of sight, µm.
 
@@ -243,13 +258,20 @@ def fill(ax: Axes, frame: Frame, place: int, layout: PanelLayout, titles: Sequen
         )
     elif layout.style.channels is not None:
         ax.set_facecolor("black")
+    solid = solid_section(frame, place, layout.style, cells)
+    if solid is not None:
+        assert frame.origin is not None and frame.spacing is not None
+        shape = frame.solid[place].shape
+        low, high = box(frame.origin[place], frame.spacing, shape, layout.style.view)
+        add_obstacles(ax, solid, (low[0], high[0], low[1], high[1]))
     add_walls(ax, frame.walls, int(frame.colony_id[place]), layout.style.view)
     add_faces(ax, frame.faces, layout.style.view)
     shown = with_images(cells, frame.faces, layout.style.view, layout.windows[place])
     add_cells(ax, shown, layout.scales, layout.style)
     whole = ax.figure.get_figwidth()  # type: ignore[union-attr]
     inches = ax.get_position().width * whole + 0.5 * GAP
-    ax.set_title(next((t for t in titles if LETTER * len(t) <= inches), ""), fontsize=7, pad=2.5)
+    title = next((t for t in titles if LETTER * len(t) <= inches), "")
+    ax.set_title(title, fontsize=7, pad=2.5, parse_math=False)
 
 
 def make_page(
@@ -301,7 +323,7 @@ def make_page(
 
 def checked_dpi(dpi: float) -> float:
     """The pixels per inch of a picture. Raises InputError for what is no number from 1 on."""
-    return checks.number("dpi", dpi, least=1.0, hint="Pixels per inch.")
+    return checks.number("dpi", dpi, least=1.0, most=MOST_DPI, hint="Pixels per inch.")
 
 
 def set_page_title(figure: Figure, title: str) -> None:
@@ -313,6 +335,7 @@ def set_page_title(figure: Figure, title: str) -> None:
         y=1 - 0.6 * EDGE / high,
         va="top",
         linespacing=1.1,
+        parse_math=False,  # names may hold a $
     )
 
 

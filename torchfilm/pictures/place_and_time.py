@@ -11,7 +11,9 @@ import torch
 from torchfilm.io.identity import declared_fields
 from torchfilm.io.results import Results
 from torchfilm.physics import capsule
+from torchfilm.pictures.colours import checked_range
 from torchfilm.pictures.figures import check_not_results, opened
+from torchfilm.pictures.page import checked_dpi
 from torchfilm.pictures.picture import Picture, new_figure
 from torchfilm.spatial import binned_mean, checked_edges
 from torchfilm.state import OUTSIDE
@@ -46,6 +48,8 @@ def kymograph(
     with opened(what) as results:
         check_not_results(results.path, out)
         checks.choice("along", along, ALONG[: int(results.attributes["dim"])] + ALONG[3:])
+        checked_dpi(dpi)
+        low, high = (None, None) if limits is None else checked_range("limits", limits)
         if len(results) < 2:
             raise checks.InputError(f"a kymograph needs two frames, and {results.path} has one")
         ids = results.colony_id.tolist()
@@ -57,20 +61,28 @@ def kymograph(
         if not len(places):
             raise checks.InputError(f"colony {chosen} of {results.path} has no cell in any frame")
         bins, values = _bins(places, edges), np.concatenate([value for _, value in seen])
+        if not ((places >= bins[0]) & (places <= bins[-1])).any():
+            span = f"a range with cells, which are at {places.min():.3g} to {places.max():.3g} µm"
+            raise checks.input_error("edges", (float(bins[0]), float(bins[-1])), span)
         frame = np.repeat(np.arange(len(seen)), [len(place) for place, _ in seen])
         groups = Groups(torch.from_numpy(frame), len(seen), ordered=True)
         value, place = torch.from_numpy(values), torch.from_numpy(places)
         grid = binned_mean(groups, value, place, bins.tolist()).numpy()
         figure = new_figure(5.0, 4.0, dpi)
         ax = figure.add_subplot()
-        low, high = (None, None) if limits is None else checks.vector("limits", limits, 2)
-        mesh = ax.pcolormesh(bins, _between(results.times), grid, vmin=low, vmax=high)
+        # as in other pictures, whatever the style
+        mesh = ax.pcolormesh(
+            bins, _between(results.times), grid, vmin=low, vmax=high, cmap="viridis"
+        )
+        ax.grid(False)
         ax.invert_yaxis()
         where = "distance from the centre" if along == "radius" else along
+        ax.set(xlabel=f"{where} (µm)", ylabel="time (h)")
         title = f"{quantity}, colony {chosen}" if len(ids) > 1 else quantity
-        ax.set(xlabel=f"{where}, µm", ylabel="time, h", title=title)
+        ax.set_title(title, parse_math=False)
         unit = _unit(results, quantity)
-        figure.colorbar(mesh, label=f"{quantity}, {unit}" if unit else quantity)
+        bar = figure.colorbar(mesh)
+        bar.set_label(f"mean of {quantity}" + f" ({unit})" * bool(unit), parse_math=False)
         return Picture(figure, out)
 
 
@@ -87,8 +99,11 @@ def _seen(
     known = {n: x for n, x in cells.items() if x.ndim == 1 and n not in results.internal_fields}
     known |= {OUTSIDE + n: x for n, x in signals.items()}
     if quantity not in known:
-        listed = ", ".join(n for n in known if n not in ("uid", "parent", "colony"))
-        raise checks.input_error("quantity", quantity, f"one of {listed}")
+        names = [n for n in known if n not in ("uid", "parent", "colony")]
+        hint = checks.suggestion(quantity, names)
+        if quantity in signals:
+            hint = f"What is outside of cells is {OUTSIDE + quantity!r}."
+        raise checks.input_error("quantity", quantity, f"one of {', '.join(names)}", hint)
     mine = cells["colony"] == place
     position, value = cells["position"][mine], known[quantity][mine].astype(float)
     if along != "radius":

@@ -111,3 +111,9 @@ class Output:
             self._handle = display(data, metadata=metadata, raw=True, display_id=True)
         else:
             self._handle.update(data, metadata=metadata, raw=True)
+
+
+def shortened(words: str, most: int) -> str:
+    """At most so many letters of a text, without its middle."""
+    half = (most - 1) // 2
+    return words if len(words) <= most else f"{words[:half]}…{words[-half:]}"
