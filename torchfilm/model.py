@@ -327,7 +327,7 @@ def advanced(state: State, dt: float) -> State:
     """The state with its fields checked and its step counted; evenly, so that time gathers no
     rounding."""
     state.check_fields()
-    return state.replace(step=state.step + 1, time=later(state.time, state.step, dt))
+    return state.replace(step=state.step + 1, time=later(state.time, state.step, dt), dt=dt)
 
 
 @one_torch_thread()

@@ -108,9 +108,8 @@ class State:
     (N,) µm · fields, by name. colony_id (B,): which colony of the scene each is; parameters per
     colony go by it. stream (B,): which course of random numbers each follows, by default its
     colony_id; colonies of one stream and alike in their parameters are alike in all. next_uid (B,).
-    A field is also an attribute: `state.growth_rate`. layout: where the voxels of signals are, in a
-    scene that has a medium; a signal's values are `state.signals["ahl"]`, (nodes,). space: where
-    cells are, if it is periodic.
+    A field is also an attribute: `state.growth_rate`. layout: of the voxels of a medium, where
+    `state.signals["ahl"]` (nodes,) is. space: if it is periodic. dt: h, of the step that led here.
     """
 
     colony: Tensor
@@ -126,6 +125,7 @@ class State:
     seed: int
     step: int = 0
     time: float = 0.0
+    dt: float = 0.0
     fields: Mapping[str, Tensor] = field(default_factory=dict)
     declared: Mapping[str, Field] = field(default_factory=dict)
     layout: Layout | None = None

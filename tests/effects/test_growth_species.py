@@ -13,7 +13,7 @@ DT = 0.025
 def eats(u, s, p, cell):
     """The scarcer of two nutrients limits growth. Cells are larger when they grow by it."""
     pace = p.rate * torch.minimum(s.glucose / (p.K + s.glucose), s.oxygen / (p.K + s.oxygen))
-    grown = pace * torch.exp(cell.growth_rate * p.dt)
+    grown = pace * torch.exp(cell.growth_rate * cell.dt)
     cost = grown * cell.volume
     return {"grown": grown}, {"glucose": -cost / p.per_glucose, "oxygen": -cost / p.per_oxygen}
 
@@ -25,7 +25,7 @@ def scene(*more, contacts=True, backend="compiled", dt=DT, initial=1.0, law=eats
         tf.Division(length=tf.Uniform(3.5, 4.0), conserves="volume"),
         *([tf.Mechanics(dim=2)] if contacts else []),
         tf.Circuit(
-            law, species="grown", rate=torch.tensor([1.0, 0.7]), K=0.2, dt=dt, per_glucose=0.5,
+            law, species="grown", rate=torch.tensor([1.0, 0.7]), K=0.2, per_glucose=0.5,
             per_oxygen=1.0, backend=backend,
         ),
         tf.Medium(glucose=fed, oxygen=fed, box=((-32, -32), (32, 32)), spacing=4.0, depth=1.0),
@@ -57,9 +57,9 @@ def gained(first: tf.State, state: tf.State) -> torch.Tensor:
 def test_the_growth_rate_is_that_of_the_species_to_second_order(dt, off):
     """2 sinh(g/2) = rate · dt for the growth g of a step, so that the rate is off by (rate·dt)²/24;
     the first steps, which start from no growth, are left out."""
-    rates = lambda u, s, p, cell: {"grown": p.pace * torch.exp(cell.growth_rate * p.dt)}
+    rates = lambda u, s, p, cell: {"grown": p.pace * torch.exp(cell.growth_rate * cell.dt)}
     built = tf.Scene(
-        tf.Growth(species="grown"), tf.Circuit(rates, species="grown", pace=1.0, dt=dt),
+        tf.Growth(species="grown"), tf.Circuit(rates, species="grown", pace=1.0),
         founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 2.0, 0.5), dt=dt,
     )  # fmt: skip
     _, state = after(built.bind(dtype=torch.float64), 12)
@@ -67,11 +67,34 @@ def test_the_growth_rate_is_that_of_the_species_to_second_order(dt, off):
     assert float(state.growth_rate) == pytest.approx(2 * math.asinh(dt / 2) / dt, rel=1e-9)
 
 
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+@pytest.mark.parametrize("parts", [1, 4])
+def test_rates_know_the_length_of_the_step_that_is_taken(backend, parts):
+    """Whatever the scene's dt is, and in whichever parts circuits and medium take it."""
+
+    def takes(u, s, p, cell):
+        grown = 0.2 * torch.exp(cell.growth_rate * cell.dt)
+        return {"grown": grown, "seen_dt": (cell.dt - u.seen_dt) / 1e-3}, {
+            "food": -grown * cell.volume
+        }
+
+    built = tf.Scene(
+        tf.Growth(species="grown"),
+        tf.Circuit(takes, species=("grown", "seen_dt"), dilution="grown", backend=backend),
+        tf.Medium(food=tf.Signal(diffusion=10.0, initial=100.0), box=((-8, -8), (8, 8)),
+                  spacing=4.0, steps=parts),
+        founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 2.0, 0.5), dt=0.025,
+    )  # fmt: skip
+    *_, state = tf.simulate(built, built.bind(dtype=torch.float64).start(), until=2.0, dt=0.1)
+    assert float(state.fields["seen_dt"]) == pytest.approx(0.1, rel=1e-6)
+    assert state.dt == 0.1
+
+
 def plain(u, s, p, cell):
     """Hungry cells, and no thought of the size that cells will have."""
     half = 0.02 * p.K
     pace = p.rate * torch.minimum(s.glucose / (half + s.glucose), s.oxygen / (half + s.oxygen))
-    cost = pace * cell.volume * torch.exp(0 * p.dt)
+    cost = pace * cell.volume
     return {"grown": pace}, {"glucose": -cost / p.per_glucose, "oxygen": -cost / p.per_oxygen}
 
 

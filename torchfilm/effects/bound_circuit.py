@@ -104,6 +104,7 @@ class BoundCircuit(BoundEffect):
             state = self.ready(state)
         if state.cells == 0:
             return state
+        given, state = state, state.replace(dt=self.binding.dt)
         circuit, signals = self.effect, tuple(state.signals)
         self.networks = {
             k: build_network(part, tuple(circuit.variables), signals)
@@ -155,7 +156,7 @@ class BoundCircuit(BoundEffect):
             medium.find()
         for kind in self.rates:
             self.cells(state, cells_of_type(state, kind), kind, medium=medium)
-        return state
+        return given
 
     def _unlike(
         self, state: State, rows: Tensor, kind: Kind, found: Mapping[str, Tensor]
@@ -299,7 +300,7 @@ class BoundCircuit(BoundEffect):
     ) -> tuple[State, dict[Kind, Tensor], Surroundings, Taken]:
         """For `changed`: the state half way, the cells by type, what they begin with, and the steps
         that kernels take."""
-        now = state.replace(time=state.time + (done + 0.5) * dt)
+        now = state.replace(time=state.time + (done + 0.5) * dt, dt=dt * number)
         middle, start = self.begun(now, 1.0 / (number - done))
         rows = {k: x for k in self.rates if (x := cells_of_type(state, k)).numel()}
         signals, pool = ({}, None) if medium is None else (medium.first, medium.pool)

@@ -11,12 +11,13 @@ from torchfilm.state import CELL, State
 Kind = int | str
 
 OF_CELLS = ("length", "radius", "volume", "area", "uid")
+OF_STEPS = ("time", "dt")
 
 
 def cell_names(state: State, species: tuple[str, ...]) -> list[str]:
     """What a rate function may read of its cell."""
     fields = [n for n in state.fields if state.declared[n].scope == CELL and n not in species]
-    return [*fields, *OF_CELLS, *"xyz"[: state.dim], "colony", "time"]
+    return [*fields, *OF_CELLS, *"xyz"[: state.dim], "colony", *OF_STEPS]
 
 
 def cell_column(state: State, name: str) -> Tensor:
@@ -26,7 +27,9 @@ def cell_column(state: State, name: str) -> Tensor:
         return state.position[:, "xyz".index(name)].to(state.dtype)
     if name == "colony":
         return state.own_colony_id
-    return state.length.new_full((), state.time) if name == "time" else state.fields[name]
+    if name in OF_STEPS:
+        return state.length.new_full((), getattr(state, name))
+    return state.fields[name]
 
 
 def cells_of_type(state: State, kind: Kind) -> Tensor:
