@@ -61,7 +61,7 @@ def test_bins_are_those_where_cells_are_and_signals_and_radii(run, tmp_path):
 def test_the_words_and_the_range(run):
     picture = tf.pictures.kymograph(run, "level", limits=(-1.0, 1.0))
     axes = picture.figure.axes[0]
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x, µm", "time, h")
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (µm)", "time (h)")
     assert axes.get_title() == "level, colony 0" and axes.yaxis_inverted()
     assert mesh(picture).get_clim() == (-1.0, 1.0)
 

@@ -18,6 +18,7 @@ from torchfilm.pictures.movies import movie
 from torchfilm.pictures.picture import Picture, new_figure
 from torchfilm.pictures.place_and_time import kymograph
 from torchfilm.pictures.shapes import VIEWS, outlines
+from torchfilm.pictures.time_course import time_course
 
 __all__ = [
     "VIEWS",
@@ -37,4 +38,5 @@ __all__ = [
     "scale_bar",
     "show",
     "strip",
+    "time_course",
 ]

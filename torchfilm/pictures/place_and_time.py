@@ -80,7 +80,7 @@ def kymograph(
         ax.set(xlabel=f"{where} (µm)", ylabel="time (h)")
         title = f"{quantity}, colony {chosen}" if len(ids) > 1 else quantity
         ax.set_title(title, parse_math=False)
-        unit = _unit(results, quantity)
+        unit = unit_at_cells(results, quantity)
         bar = figure.colorbar(mesh)
         bar.set_label(f"mean of {quantity}" + f" ({unit})" * bool(unit), parse_math=False)
         return Picture(figure, out)
@@ -95,15 +95,7 @@ def _seen(
     results: Results, frame: int, place: int, quantity: str, along: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where the cells of a colony are, and what they have of the quantity, at a frame, (N,)."""
-    cells, signals = results.frame(frame), results.signals_at_cells(frame)
-    known = {n: x for n, x in cells.items() if x.ndim == 1 and n not in results.internal_fields}
-    known |= {OUTSIDE + n: x for n, x in signals.items()}
-    if quantity not in known:
-        names = [n for n in known if n not in ("uid", "parent", "colony")]
-        hint = checks.suggestion(quantity, names)
-        if quantity in signals:
-            hint = f"What is outside of cells is {OUTSIDE + quantity!r}."
-        raise checks.input_error("quantity", quantity, f"one of {', '.join(names)}", hint)
+    cells, (known, _) = results.frame(frame), known_quantities(results, frame, quantity)
     mine = cells["colony"] == place
     position, value = cells["position"][mine], known[quantity][mine].astype(float)
     if along != "radius":
@@ -114,6 +106,24 @@ def _seen(
     return np.hypot(*(position - centre)[:, :2].T), value
 
 
+def known_quantities(
+    results: Results, frame: int, *wanted: str
+) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+    """What a frame tells of each cell, (N,) by name, signals at the cells under "out.NAME"; and the
+    names that are wanted. Raises InputError for one that it does not tell."""
+    cells, signals = results.frame(frame), results.signals_at_cells(frame)
+    known = {n: x for n, x in cells.items() if x.ndim == 1 and n not in results.internal_fields}
+    known |= {OUTSIDE + n: x for n, x in signals.items()}
+    names = [n for n in known if n not in ("uid", "parent", "colony")]
+    for quantity in wanted:
+        if quantity not in known:
+            hint = checks.suggestion(quantity, names)
+            if quantity in signals:
+                hint = f"What is outside of cells is {OUTSIDE + quantity!r}."
+            raise checks.input_error("quantity", quantity, f"one of {', '.join(names)}", hint)
+    return known, wanted
+
+
 def _bins(places: np.ndarray, edges: Sequence[float] | None) -> np.ndarray:
     """The edges of the bins, (K + 1,) µm."""
     if edges is None:
@@ -122,7 +132,8 @@ def _bins(places: np.ndarray, edges: Sequence[float] | None) -> np.ndarray:
     return np.array(checked_edges("kymograph", edges))
 
 
-def _unit(results: Results, quantity: str) -> str:
+def unit_at_cells(results: Results, quantity: str) -> str:
+    """The unit of a quantity of the cells, or of a signal at them; "" without."""
     if quantity.startswith(OUTSIDE):
         return CONCENTRATION
     declared = declared_fields(results.attributes)

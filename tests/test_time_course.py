@@ -1,0 +1,82 @@
+"""The picture of a run against time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import torchfilm as tf
+
+matplotlib = pytest.importorskip("matplotlib")
+
+
+def makes(u, s, p, cell):
+    return {"gfp": p.make - u.gfp}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    path = tmp_path_factory.mktemp("time_course") / "run.h5"
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(2.5, 3.5)),
+        tf.Circuit(makes, species="gfp", make=torch.linspace(1.0, 2.0, 5)),
+        tf.Lysis(rate=torch.tensor([0.0, 0.0, 0.0, 0.0, 1e9])),
+        tf.Medium(m=tf.Signal(diffusion=0.0, initial=lambda x: x[:, 0] + 9.0), spacing=1.0,
+                  box=((-9, -9), (9, 9))), dim=2, dt=0.1,
+    )  # fmt: skip
+    list(tf.simulate(scene, until=3.0, record=path, seed=2))
+    return path
+
+
+def lines(ax) -> list[tuple[np.ndarray, np.ndarray]]:
+    return [line.get_xydata().T for line in ax.lines]
+
+
+def test_it_shows_the_counts_and_the_means_of_the_cells(run, tmp_path):
+    picture = tf.pictures.time_course(run, "gfp", "out.m", colonies=[0, 3], out=tmp_path / "t.png")
+    assert (tmp_path / "t.png").exists()
+    counts, gfp, outside = picture.figure.axes
+    with tf.Results(run) as results:
+        for k, colony in enumerate((0, 3)):
+            times, drawn = lines(counts)[k]
+            assert np.array_equal(times, results.times)
+            assert np.array_equal(drawn, results.counts[:, colony])
+            for f in range(len(results)):
+                frame = results.frame(f)
+                mine = frame["colony"] == colony
+                assert lines(gfp)[k][1][f] == pytest.approx(frame["gfp"][mine].mean())
+                signal = results.signals_at_cells(f)["m"][mine]
+                assert lines(outside)[k][1][f] == pytest.approx(signal.mean())
+                low, high = np.percentile(frame["gfp"][mine], [10, 90])
+                band = gfp.collections[k].get_paths()[0].vertices
+                at = band[np.isclose(band[:, 0], results.times[f])][:, 1]
+                assert at.min() == pytest.approx(low) and at.max() == pytest.approx(high)
+    assert gfp.get_ylabel() == "mean of gfp (conc)" and outside.get_xlabel() == "time (h)"
+    assert [t.get_text() for t in counts.get_legend().get_texts()] == ["colony 0", "colony 3"]
+
+
+def test_colonies_that_die_leave_the_picture_and_many_have_no_bands(run):
+    """The last one is gone after the first frame."""
+    picture = tf.pictures.time_course(run, "gfp")
+    counts, gfp = picture.figure.axes
+    assert len(counts.lines) == 5 and not gfp.collections
+    assert np.isnan(lines(counts)[4][1][1:]).all() and lines(counts)[4][1][0] == 1
+    two = tf.pictures.time_course(run, most=2)
+    assert len(two.figure.axes[0].lines) == 2
+    assert "first 2 of 5 colonies" in two.figure._suptitle.get_text()
+
+
+@pytest.mark.parametrize(
+    ("names", "options", "words"),
+    [
+        (("gpf",), {}, "quantity = 'gpf'.*Did you mean 'gfp'"),
+        (("m",), {}, "What is outside of cells is 'out.m'"),
+        ((), {"colonies": [7]}, "colonies"),
+        ((), {"most": 0}, "most"),
+        ((), {"dpi": 0}, "dpi"),
+    ],
+)
+def test_bad_input(run, names, options, words):
+    with pytest.raises(tf.InputError, match=words):
+        tf.pictures.time_course(run, *names, **options)
