@@ -72,7 +72,8 @@ class Posterior:
             raise checks.input_error(
                 "observed",
                 data.describe(),
-                f"data of the same statistics from {self.observed.colonies} colonies",
+                f"data of the same statistics, each from as many colonies as before"
+                f" ({', '.join(map(str, dict.fromkeys(colonies[1])))})",
                 "Make it with like=…; of Measured, with the same functions and spreads.",
             )
         when = self.observed.time if self.task.until is None else self.task.until

@@ -164,7 +164,9 @@ class Task(TaskOptions):
         if cells is not None:
             cells = max(self.tried.founders + 1, round(cells * size))
         if until is not None:
-            until = max(1, round(until * size / dt)) * dt
+            # a smaller colony must reach the first time at which the target sees it
+            first = min((time for time in self.target.times if time <= until), default=0.0)
+            until = max(max(1, round(until * size / dt)) * dt, first)
         return cells, until
 
     def resized(self, factor: float) -> Task:

@@ -293,7 +293,7 @@ class Observed(Target):
         apart = self.residuals(state, history)
         # column by column: a sum over many columns may depend on the number of rows
         loss = sum((a * a for a in apart.unbind(1)), apart.new_zeros(len(apart)))
-        return torch.where(state.counts > 0, loss, self.failed)
+        return torch.where(state.counts >= self.fewest, loss, self.failed)
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:

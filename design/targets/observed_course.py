@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -296,9 +297,9 @@ def _measured(
 
 def _column(label: str, given: Any, count: int, one_will_do: bool) -> list[float]:
     """A number for each time, NaN where one is missing."""
-    if one_will_do and isinstance(given, (int, float)):
-        return [float(given)] * count
     try:
+        if one_will_do and np.ndim(given) == 0:
+            return [float(given)] * count
         found = [float(x) for x in given]
     except (TypeError, ValueError):
         found = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -22,8 +23,8 @@ class MeasureStatistics:
     errors: tuple[float, ...]
     code: str
     species: tuple[str, ...] = ()
-    ages: bool = False
-    positions: bool = False
+    ages: ClassVar[bool] = False
+    positions: ClassVar[bool] = False
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:

@@ -122,6 +122,33 @@ def test_a_first_look_does_not_compare_the_last_time():
     assert objective.evaluate(truth).loss[0] > 1e3
 
 
+@pytest.mark.parametrize("size", [0.1, 0.25])
+def test_a_first_look_reaches_the_first_time(size):
+    known = levels(1.0, 1.0)
+    course = of({"bulk": bulk}, {"bulk": [known[0], 50.0, 50.0]}, {"bulk": 0.01})
+    objective = objective_of(colony, MAKE, course, **OPTIONS)
+    points = np.array([objective.task.space.point({"make": m}) for m in (1.0, 2.0)])
+    assert objective.task.end(size) == (None, 0.5)
+    near, far = objective.evaluate(points, size=size).loss
+    assert near < 0.1 < 100.0 < far
+
+
+def test_colonies_that_die_may_be_data():
+    """All cells burst before the end, as an antibiotic makes them; there is nothing left to fit."""
+    dying = lambda make=1.0: tf.Scene(*colony(make).effects, tf.Lysis(rate=1e9), dt=0.1)
+    for extinct, loss in ((True, 0.0), (False, None)):
+        course = of({"volume": volume}, {"volume": [0.0] * 3}, {"volume": 1.0}, extinct=extinct)
+        found = objective_of(dying, MAKE, course, **OPTIONS).evaluate(np.array([[0.5]]))
+        assert found.loss[0] == (course.failed if loss is None else loss)
+        assert bool(found.reasons) != extinct
+
+
+def test_a_course_ends_with_its_last_time():
+    course = of({"bulk": bulk}, {"bulk": [1, 2, 3]}, {"bulk": np.float32(1.0)})
+    *_, state = tf.simulate(colony(), until=1.0, dt=0.1)
+    assert "observed at 2 h" in course.unfit(state)[0]
+
+
 def test_one_time_ends_a_colony():
     data = Measured({"bulk": bulk}, {"bulk": 0.5}, {"bulk": 0.1}, time=1.0)
     assert Task(colony, MAKE, data, **OPTIONS).until == 1.0

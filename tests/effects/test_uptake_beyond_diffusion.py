@@ -78,6 +78,27 @@ def test_a_closed_box_is_not_emptied_faster_than_it_diffuses():
     assert left[1:] == pytest.approx([left[0]] * 2, rel=2e-3) and left[0] > 0.6 * start
 
 
+@pytest.mark.parametrize("K", [1e-7, 1e-9])
+def test_cells_that_do_not_eat_excuse_nobody(K):
+    """A hundred of them lie above one that eats, whose share is small in sums over the colony."""
+    places = [[2.0 + 4.0 * (i % 4), 14.0 + 4.0 * (i // 4)] for i in range(100)]
+    cells = tf.Cells(
+        [[2.0, 2.0], *places], [[1.0, 0.0]] * 101, length=1.0, cell_type=[0] + [1] * 100
+    )
+    medium = tf.Medium(
+        o2=tf.Signal(diffusion=10.0, initial=1.0), spacing=4.0, depth=4.0,
+        box=((0, 0), (16, 116)),
+        boundary=tf.BoundaryConditions(x=tf.Periodic(), y=(tf.NoFlux(), tf.Dirichlet(1.0))),
+    )  # fmt: skip
+    found = []
+    for half in (1e-5, K):
+        circuit = tf.Circuit(eats, species="used", K=half, q={0: 1000.0, 1: 0.0})
+        built = tf.Scene(circuit, medium, dim=2, dt=0.01, founders=cells)
+        *_, last = tf.simulate(built, built.bind(dtype=torch.float64).start(), until=1.0)
+        found.append(uptake(last))
+    assert found[1] == pytest.approx(found[0], rel=1e-3)
+
+
 def test_what_is_too_steep_to_be_solved_is_said():
     with pytest.warns(RuntimeWarning, match="colony 0: exchange and transport of signals"):
         list(tf.simulate(scene(1e-20, 100.0, 0.05), until=0.1))
