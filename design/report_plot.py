@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 SHOWN = 3  # replicates side by side, or one under so many conditions
 MOST_SHOWN = 6
-LETTERS, OPTION = 34, 10  # that are shown of a parameter, and of an option
+LETTERS, OPTION = 16, 10  # that are shown of a name of a parameter, and of an option
 # losses of which the largest is so many times the smallest are drawn by their logarithms
 WIDE = 100.0
 
@@ -232,11 +232,6 @@ def _draw_parameters(ax: Axes, report: SearchReport) -> None:
             if isinstance(p, Parameter)
             else tuple(tf.displays.shortened(str(p.options[k]), OPTION) for k in (0, -1))
         )
-        ax.annotate(
-            tf.displays.shortened(f"{p.name} = {show_value(best.values[p.name])}", LETTERS), (0, y),
-            xytext=(-4, 6), textcoords="offset points", va="bottom", fontsize=8,
-            annotation_clip=False, parse_math=False,
-        )  # fmt: skip
         for x, bound, side in ((0, low, "right"), (1, high, "left")):
             ax.annotate(
                 bound,
@@ -248,8 +243,12 @@ def _draw_parameters(ax: Axes, report: SearchReport) -> None:
                 fontsize=7,
                 color="0.4",
             )
-    ax.set(yticks=[], xticks=[], xlim=(-0.28, 1.28))
-    ax.set_ylim(-0.7, space.size - 0.1)
+    names = [tf.displays.shortened(p.name, LETTERS) for p in space.parameters]
+    values = [show_value(best.values[p.name]) for p in space.parameters]
+    labels = [f"{name} = {value}" for name, value in zip(names, values, strict=True)]
+    ax.set(yticks=rows, yticklabels=labels, xticks=[], xlim=(-0.28, 1.28))
+    ax.set_ylim(-0.7, space.size - 0.3)
+    ax.tick_params(left=False)
     for side in ("left", "right", "top", "bottom"):
         ax.spines[side].set_visible(False)
     ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=2, frameon=False)
