@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -120,6 +122,13 @@ def test_a_scale_bar_keeps_its_length(change):
     assert drawn == pytest.approx(wanted, rel=1e-6)
 
 
+def test_a_figure_with_a_scale_bar_can_be_pickled():
+    ax = Figure().add_subplot()
+    pictures.scale_bar(ax)
+    (copied,) = pickle.loads(pickle.dumps(ax.figure)).axes
+    assert len(copied.lines) == 1
+
+
 def test_a_scale_bar_of_a_very_narrow_window_and_of_a_dark_style():
     with matplotlib.rc_context({"text.color": "white"}):
         ax = Figure().add_subplot()
@@ -176,7 +185,8 @@ def test_a_file_of_a_box_that_grew_has_no_obstacles_to_show(tmp_path):
     with tf.Results(tmp_path / "run.h5") as results:
         frame = RecordedFrames(results, [0], "ahl")[0]
         assert frame.solid and frame.solid[0].any()
-        assert _solid(results, np.array([[17, 8, 1]])) == ()
+        kept = results.file["obstacles"][...]
+        assert _solid(kept, np.array([[17, 8, 1]])) == ()
 
 
 def test_text_is_written_as_it_is():

@@ -140,7 +140,7 @@ class Lysis(Effect):
         path = f"Lysis.releases[{signal!r}]"
         if not is_name(signal):
             raise checks.input_error("Lysis.releases", signal, "keys that name signals")
-        shares = isinstance(what, Mapping) and any(isinstance(n, str) for n in what)
+        shares = _has_shares(what)
         names = tuple(what) if isinstance(what, tuple | list) or shares else (what,)
         if names and all(map(is_name, names)):
             if {LENGTH, *_NO_LEVELS} & {*names}:
@@ -181,7 +181,7 @@ class Lysis(Effect):
         for s, what in self.releases.items():
             if not _is_named(what):
                 found[f"releases[{s}]"] = (what, AMOUNT)
-            elif isinstance(what, Mapping):
+            elif _has_shares(what):
                 found |= {f"releases[{s}][{n}]": (x, SHARE) for n, x in what.items()}
         return found
 
@@ -328,17 +328,20 @@ class BoundLysis(BoundEffect):
         held = [
             _quantity(state, n) * (state.volume if _is_species(state, n) else 1.0) for n in what
         ]
-        if isinstance(what, Mapping):
+        if _has_shares(what):
             shares = (self.values[f"releases[{signal}][{n}]"].of_cells(state) for n in what)
             held = [x * share for x, share in zip(held, shares, strict=True)]
         return functools.reduce(torch.add, held)  # in this order, whatever the batch
 
 
+def _has_shares(what: Any) -> bool:
+    """Whether a release says how much of each name; a dict by cell types is an amount."""
+    return isinstance(what, Mapping) and any(isinstance(n, str) for n in what)
+
+
 def _is_named(what: Any) -> bool:
     """Whether a release is of what a cell holds, and not an amount."""
-    return isinstance(what, tuple) or (
-        isinstance(what, Mapping) and any(isinstance(n, str) for n in what)
-    )
+    return isinstance(what, tuple) or _has_shares(what)
 
 
 def _quantity(state: State, name: str) -> Tensor:

@@ -303,7 +303,10 @@ def scale_bar(ax: Axes) -> float:
 
     Returns its length, µm.
     """
+    from matplotlib import rcParams
     from matplotlib.transforms import ScaledTranslation
+
+    from torchfilm.pictures.bar import ScaleBar
 
     _check_axes(ax)
     low, high = sorted(ax.get_xlim())
@@ -312,7 +315,7 @@ def scale_bar(ax: Axes) -> float:
     size = max(s for s in (10.0**power, 2 * 10.0**power, 5 * 10.0**power) if s <= rough)
     # in units of the axes, so that the bar moves with them
     below = ax.transAxes + ScaledTranslation(0, -5 / 72, ax.figure.dpi_scale_trans)
-    ax.add_line(_bar(ax, size, below))
+    ax.add_line(ScaleBar(size, below, rcParams["text.color"]))
     ax.annotate(
         f"{size:g} µm",
         (0, 0),
@@ -324,24 +327,6 @@ def scale_bar(ax: Axes) -> float:
         annotation_clip=False,
     )
     return size
-
-
-def _bar(ax: Axes, size: float, transform: Any) -> Any:
-    """A line of so many µm of the axes, from their left end, whenever it is drawn."""
-    from matplotlib import rcParams
-    from matplotlib.lines import Line2D
-
-    class Bar(Line2D):
-        def draw(self, renderer: Any) -> None:
-            low, high = sorted(ax.get_xlim())
-            self.set_xdata([0, size / (high - low)])
-            super().draw(renderer)
-
-    low, high = sorted(ax.get_xlim())
-    return Bar(
-        [0, size / (high - low)], [0, 0], transform=transform, color=rcParams["text.color"],
-        linewidth=2.0, solid_capstyle="butt", clip_on=False,
-    )  # fmt: skip
 
 
 def colour_bar(ax: Axes, scale: Scale) -> None:

@@ -167,8 +167,15 @@ class RecordedFrames(Sequence[Frame]):
             self.faces,
             results.internal_fields,
             _named(results.parameters(place)),
-            _solid(results, shape),
+            _solid(self._obstacles, shape),
         )
+
+    @cached_property
+    def _obstacles(self) -> np.ndarray | None:
+        """Where obstacles were in the first frame of the file, (voxels,); None where it does not
+        say."""
+        kept = self.results.file.get(OBSTACLES)
+        return None if kept is None else kept[...].astype(bool)
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
@@ -190,13 +197,12 @@ class RecordedFrames(Sequence[Frame]):
         return str(self.results.attributes["scene"]).splitlines()[0].split(":")[0]
 
 
-def _solid(results: Results, shape: np.ndarray) -> Sequence[np.ndarray]:
-    """Where obstacles are in grids of these shapes (B, 3); nothing where the file does not say, as
-    of a box that has grown."""
-    kept = results.file.get(OBSTACLES)
+def _solid(kept: np.ndarray | None, shape: np.ndarray) -> Sequence[np.ndarray]:
+    """Where obstacles are in grids of these shapes (B, 3), of what a file keeps; nothing where it
+    does not say, as of a box that has grown."""
     if kept is None or kept.shape != (shape.prod(1).sum(),):
         return ()
-    return _parted(kept[...].astype(bool), shape)
+    return _parted(kept, shape)
 
 
 def _named(parameters: Mapping[str, np.ndarray]) -> list[str] | None:

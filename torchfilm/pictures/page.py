@@ -233,6 +233,13 @@ def _where(frame: Frame, style: PlotStyle) -> str:
     return f", {letter} = {at:g} µm"
 
 
+def _extent(frame: Frame, place: int, style: PlotStyle) -> Window:
+    """The box of a colony's medium in the view."""
+    assert frame.origin is not None and frame.spacing is not None and frame.shape is not None
+    low, high = box(frame.origin[place], frame.spacing, tuple(frame.shape[place]), style.view)
+    return low[0], high[0], low[1], high[1]
+
+
 def fill(ax: Axes, frame: Frame, place: int, layout: PanelLayout, titles: Sequence[str]) -> None:
     """Draw one colony of one frame in a panel, and replace what the panel showed.
 
@@ -243,27 +250,13 @@ def fill(ax: Axes, frame: Frame, place: int, layout: PanelLayout, titles: Sequen
     set_window(ax, layout.windows[place])
     cells = frame.colony(place)
     if layout.behind is not None:
-        assert frame.origin is not None and frame.spacing is not None
-        low, high = box(
-            frame.origin[place],
-            frame.spacing,
-            frame.signals[str(layout.style.background)][place].shape,
-            layout.style.view,
-        )
-        add_signal(
-            ax,
-            signal_section(frame, place, layout.style, cells),
-            (low[0], high[0], low[1], high[1]),
-            layout.behind,
-        )
+        flat = signal_section(frame, place, layout.style, cells)
+        add_signal(ax, flat, _extent(frame, place, layout.style), layout.behind)
     elif layout.style.channels is not None:
         ax.set_facecolor("black")
     solid = solid_section(frame, place, layout.style, cells)
     if solid is not None:
-        assert frame.origin is not None and frame.spacing is not None
-        shape = frame.solid[place].shape
-        low, high = box(frame.origin[place], frame.spacing, shape, layout.style.view)
-        add_obstacles(ax, solid, (low[0], high[0], low[1], high[1]))
+        add_obstacles(ax, solid, _extent(frame, place, layout.style))
     add_walls(ax, frame.walls, int(frame.colony_id[place]), layout.style.view)
     add_faces(ax, frame.faces, layout.style.view)
     shown = with_images(cells, frame.faces, layout.style.view, layout.windows[place])

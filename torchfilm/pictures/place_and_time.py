@@ -95,7 +95,7 @@ def _seen(
     results: Results, frame: int, place: int, quantity: str, along: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where the cells of a colony are, and what they have of the quantity, at a frame, (N,)."""
-    cells, (known, _) = results.frame(frame), known_quantities(results, frame, quantity)
+    cells, known = known_quantities(results, frame, quantity)
     mine = cells["colony"] == place
     position, value = cells["position"][mine], known[quantity][mine].astype(float)
     if along != "radius":
@@ -108,9 +108,9 @@ def _seen(
 
 def known_quantities(
     results: Results, frame: int, *wanted: str
-) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """What a frame tells of each cell, (N,) by name, signals at the cells under "out.NAME"; and the
-    names that are wanted. Raises InputError for one that it does not tell."""
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """The cells of a frame, and what it tells of each, (N,) by name, signals at them under
+    "out.NAME". Raises InputError for a wanted name that it does not tell."""
     cells, signals = results.frame(frame), results.signals_at_cells(frame)
     known = {n: x for n, x in cells.items() if x.ndim == 1 and n not in results.internal_fields}
     known |= {OUTSIDE + n: x for n, x in signals.items()}
@@ -121,7 +121,7 @@ def known_quantities(
             if quantity in signals:
                 hint = f"What is outside of cells is {OUTSIDE + quantity!r}."
             raise checks.input_error("quantity", quantity, f"one of {', '.join(names)}", hint)
-    return known, wanted
+    return cells, known
 
 
 def _bins(places: np.ndarray, edges: Sequence[float] | None) -> np.ndarray:

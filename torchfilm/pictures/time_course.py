@@ -48,18 +48,17 @@ def time_course(
             raise checks.InputError(f"a time course needs two frames, and {results.path} has one")
         frames = RecordedFrames(results, range(len(results)))
         places, more = choose_colonies(frames.shown(False), results.colony_id, colonies, most)
-        _, names = known_quantities(results, 0, *quantities)
-        seen = [_seen(results, k, places, names) for k in range(len(results))]
-        figure = new_figure(WIDE, HIGH * (1 + len(names)) + 0.3, dpi)
-        axes = figure.subplots(1 + len(names), 1, sharex=True, squeeze=False)[:, 0]
-        counts = results.counts[:, places]
-        labels = [frames[0].name(place) for place in places]
+        seen = [_seen(results, k, places, quantities) for k in range(len(results))]
+        figure = new_figure(WIDE, HIGH * (1 + len(quantities)) + 0.3, dpi)
+        axes = figure.subplots(1 + len(quantities), 1, sharex=True, squeeze=False)[:, 0]
+        counts, first = results.counts[:, places], frames[0]
+        labels = [first.name(place) for place in places]
         colours = _colours(len(places))
         for k, (label, colour) in enumerate(zip(labels, colours, strict=True)):
             alive = np.where(counts[:, k] > 0, counts[:, k], np.nan)
             axes[0].plot(results.times, alive, color=colour, lw=1.2, label=label)
         _finish(axes[0], "cells", log=counts.max() > TENFOLD * max(1, counts[counts > 0].min()))
-        for row, name in enumerate(names):
+        for row, name in enumerate(quantities):
             of_name = np.stack([found[row] for found in seen])  # (frames, colonies, 3)
             for k, colour in enumerate(colours):
                 mean, low, high = of_name[:, k].T
@@ -81,13 +80,12 @@ def _seen(
 ) -> list[np.ndarray]:
     """Of each quantity the mean, and the ends of the band, in each of these colonies, (C, 3); NaN
     without cells."""
-    known, _ = known_quantities(results, frame, *names)
-    colony = results.frame(frame)["colony"]
+    cells, known = known_quantities(results, frame, *names)
     out = []
     for name in names:
         found = np.full((len(places), 3), np.nan)
         for k, place in enumerate(places):
-            mine = known[name][colony == place].astype(float)
+            mine = known[name][cells["colony"] == place].astype(float)
             if len(mine):
                 found[k] = mine.mean(), *np.percentile(mine, BAND)
         out.append(found)
