@@ -135,13 +135,15 @@ class Unsplit:
                 low = x + residual < 0
                 x = torch.where(low, (x + residual * self.inverse).clamp(min=0.0), x)
                 residual = bare(right) - still(x)
-            x = x + residual
-            moved = both(right - left(x))[1]
+            # its derivatives are those at x: where next to nothing is left, the correction is as
+            # large
+            at, x = x, x + residual
+            moved = both(right - left(at))[1]
             if moved is not None:  # x' = A⁻¹ (b' − A' x)
                 turned, _ = solved(moved, torch.zeros_like(x))
                 return with_tangent(x, turned), residual, report
         if torch.is_grad_enabled():
-            remainder = right - left(x)
+            remainder = right - left(at)
             if remainder.requires_grad:
                 x = _KrylovAdjoint.apply(remainder, x, left, self)
         return x, residual, report
@@ -172,7 +174,11 @@ class _KrylovAdjoint(torch.autograd.Function):
 
         with torch.no_grad(), one_torch_thread():
             first, of = torch.zeros_like(grad), ctx.of
-            found, report = krylov(left, grad, first, symmetric, of.rounding, of.inverse)
+            # where next to nothing is left, losses may depend on it a million times as strongly:
+            # the residual there is not one of other voxels
+            found, report = krylov(
+                left, grad, first, symmetric, of.rounding, of.inverse, weight=of.inverse
+            )
         return (
             torch.where(report.converged.reshape(-1, 1, 1, 1), found, torch.nan),
             None,
@@ -209,39 +215,39 @@ def _ratio(a: Tensor, b: Tensor) -> Tensor:
 
 
 def krylov(
-    apply: Map, b: Tensor, start: Tensor, symmetric: bool, rounding: Tensor, inverse: Tensor
-) -> tuple[Tensor, TransportSolveReport]:
+    apply: Map, b: Tensor, start: Tensor, symmetric: bool, rounding: Tensor, inverse: Tensor,
+    weight: Tensor | None = None,
+) -> tuple[Tensor, TransportSolveReport]:  # fmt: skip
     """Solve A x = b, (B, nx, ny, nz), in float64, one system per colony, each until it converges.
 
     The residual is at most TOLERANCE of b, or its `rounding`, of the shape of b or of one, of x.
-    inverse: of the diagonal of A. No gradient.
+    inverse: of the diagonal of A. weight: of each voxel in these norms; by default 1. No gradient.
     """
     most = torch.maximum(b.abs(), start.abs()).amax((1, 2, 3), keepdim=True)
     up = torch.ones_like(most).masked_fill((most > 0) & (most < SMALL), LARGER)
     b, start = b * up, start * up
-    size = _dot(b, b)
+    norm = lambda x: _dot(x, x) if weight is None else _dot(weight * x, weight * x)
+    size = norm(b)
     x, iterations = start.clone(), torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
     # restarts from the true residual correct the rounding errors of the recurred one
     for _ in range(3):
         r = b - apply(x)
-        target = torch.maximum(TOLERANCE**2 * size, _dot(rounding * x, rounding * x))
-        going = _dot(r, r) > target
+        target = torch.maximum(TOLERANCE**2 * size, norm(rounding * x))
+        going = norm(r) > target
         if not bool(going.any()):
             break
         method = _conjugate_gradients if symmetric else _bicgstab
-        x, spent = method(apply, x, r, inverse, going, target)
+        x, spent = method(apply, x, r, inverse, going, norm, target)
         iterations += spent
     r = b - apply(x)
-    target = torch.maximum(TOLERANCE**2 * size, _dot(rounding * x, rounding * x))
-    residual = _ratio(_dot(r, r), size).sqrt().reshape(-1)
+    target = torch.maximum(TOLERANCE**2 * size, norm(rounding * x))
+    residual = _ratio(norm(r), size).sqrt().reshape(-1)
     # a right-hand side of zero has the solution zero; a NaN never converges
-    return x / up, TransportSolveReport(
-        iterations, residual, (_dot(r, r) <= 100 * target).reshape(-1)
-    )
+    return x / up, TransportSolveReport(iterations, residual, (norm(r) <= 100 * target).reshape(-1))
 
 
 def _conjugate_gradients(
-    apply: Map, x: Tensor, r: Tensor, inverse: Tensor, going: Tensor, target: Tensor
+    apply: Map, x: Tensor, r: Tensor, inverse: Tensor, going: Tensor, norm: Map, target: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Returns x and the iterations of each colony, (B,)."""
     spent = torch.zeros(x.shape[0], dtype=torch.int64, device=x.device)
@@ -252,7 +258,7 @@ def _conjugate_gradients(
         alpha = torch.where(going, _ratio(rz, _dot(p, q)), 0.0)
         x, r = torch.addcmul(x, alpha, p), torch.addcmul(r, alpha, q, value=-1.0)
         spent += going.reshape(-1)
-        going = going & (_dot(r, r) > target)
+        going = going & (norm(r) > target)
         if not bool(going.any()):
             break
         z = inverse * r
@@ -262,7 +268,7 @@ def _conjugate_gradients(
 
 
 def _bicgstab(
-    apply: Map, x: Tensor, r: Tensor, inverse: Tensor, going: Tensor, target: Tensor
+    apply: Map, x: Tensor, r: Tensor, inverse: Tensor, going: Tensor, norm: Map, target: Tensor
 ) -> tuple[Tensor, Tensor]:
     """van der Vorst's stabilised bi-conjugate gradients; returns as `_conjugate_gradients`."""
     spent = torch.zeros(x.shape[0], dtype=torch.int64, device=x.device)
@@ -278,7 +284,7 @@ def _bicgstab(
         x = torch.addcmul(x, omega, scaled)
         r = torch.where(going, torch.addcmul(s, omega, t, value=-1.0), r)
         spent += going.reshape(-1)
-        going = going & (_dot(r, r) > target)
+        going = going & (norm(r) > target)
         if not bool(going.any()):
             break
         new = _dot(shadow, r)
