@@ -85,7 +85,7 @@ ONE_EFFECT = [
     {f"torchfilm.effects.{name}" for name in names.split()}
     for names in (
         "circuit bound_circuit circuit_cells circuit_checks circuit_kernels circuit_report"
-        " circuit_sbml circuit_words",
+        " circuit_sbml circuit_words circuit_daughters",
         "division compiled_division division_lengths",
         "medium bound_medium medium_transport medium_values signal",
         "rules bound_rules bound_division_rule",

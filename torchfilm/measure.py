@@ -22,7 +22,7 @@ from torchfilm.tools import checks
 from torchfilm.tools.connected import components
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.threads import one_torch_thread
-from torchfilm.tools.vectors import safe_norm
+from torchfilm.tools.vectors import safe_norm, safe_sqrt
 
 if TYPE_CHECKING:
     from torchfilm.scene import Scene
@@ -162,28 +162,26 @@ def pressure(state: State, scene: Scene) -> Tensor:
 
 
 @of_a_state
-@torch.no_grad()
 def growth_rates(state: State, earlier: State) -> Tensor:
     """How fast each cell has grown since an earlier state of the same run, (N,) 1/h: the change of
     ln(volume) over time. NaN for cells that were born since. Pressure makes it less than the field
     `growth_rate`, which is the rate without it."""
     known, before = _known_before("growth_rates", state, earlier)
-    volume = torch.full_like(state.volume.double(), torch.nan)
-    volume[known] = earlier.volume.double()[before]
-    return (state.volume.double() / volume).log() / (state.time - earlier.time)
+    now, before = state.volume.double()[known], earlier.volume.double()[before]
+    rates = torch.full_like(state.volume.detach().double(), torch.nan)
+    return rates.index_copy(0, known, (now / before).log() / (state.time - earlier.time))
 
 
 @of_a_state
-@torch.no_grad()
 def displacement(state: State, earlier: State) -> Tensor:
     """How far each cell's centre has moved since an earlier state of the same run, (N, d) float64
     µm; NaN for cells that were born since. In a periodic space it is the way to the nearest image:
     take states between which no cell goes half of the way between the faces, and add up several."""
     known, before = _known_before("displacement", state, earlier)
-    moved = torch.full_like(state.position, torch.nan)
+    moved = torch.full_like(state.position.detach(), torch.nan)
     way = (state.position[known] - earlier.position[before]).T
-    moved[known] = (way if state.space is None else way + state.space.shift(way)).T
-    return moved
+    way = way if state.space is None else way + state.space.shift(way)
+    return moved.index_copy(0, known, way.T)
 
 
 def _known_before(measure: str, state: State, earlier: State) -> tuple[Tensor, Tensor]:
@@ -217,11 +215,11 @@ def colony_radius(state: State) -> Tensor:
     """
     from_centre = (state.position - colony_centre(state).index_select(0, state.colony))[:, :2]
     square = (from_centre * from_centre).sum(1, keepdim=True)
-    return (2.0 * state.groups.sum(square).squeeze(1) / state.counts).sqrt()
+    mean = 2.0 * state.groups.sum(square).squeeze(1) / state.counts
+    return torch.where(state.counts == 0, torch.nan, safe_sqrt(mean))
 
 
 @of_a_state
-@torch.no_grad()
 def depth(state: State) -> Tensor:
     """Extent of each colony along z, caps included, (B,) µm; one cell diameter in 2-D."""
     if state.dim == 2:
@@ -269,7 +267,6 @@ def below_top(
 
 
 @of_a_state
-@torch.no_grad()
 def nematic_order(state: State) -> Tensor:
     """Alignment of the axes of each colony in the x–y plane, (B,): 0 for random, 1 for parallel;
     NaN without cells.
@@ -279,11 +276,10 @@ def nematic_order(state: State) -> Tensor:
     x, y = state.axis[:, 0].double(), state.axis[:, 1].double()
     q = torch.stack([x * x - y * y, 2 * x * y, x * x + y * y], 1)
     total = state.groups.sum(q)
-    return (total[:, 0] ** 2 + total[:, 1] ** 2).sqrt() / total[:, 2]
+    return safe_sqrt(total[:, 0] ** 2 + total[:, 1] ** 2) / total[:, 2]
 
 
 @of_a_state
-@torch.no_grad()
 def tilt(state: State) -> Tensor:
     """Angle between each cell's axis and the x–y plane, (N,) rad, 0 … π/2."""
     if state.dim == 2:
@@ -337,7 +333,6 @@ def heterozygosity(
 
 
 @of_a_state
-@torch.no_grad()
 def profile(
     state: State, name: str | Tensor, edges: Sequence[float], *, along: str | Tensor = "x"
 ) -> Tensor:

@@ -68,11 +68,13 @@ class Draws:
         cell, (N,), or each division, (M,). Plasmids, say, that go to the first daughter:
         k = parent.binomial(parent.plasmids, 0.5)."""
         drawn = self.random()
-        count = _column("binomial", number, drawn)
-        wrong = count[~((count >= 0) & (count == count.round()) & count.isfinite())]
+        given = _column("binomial", number, drawn)
+        count = given.round()  # of molecules: a concentration times a volume, but for rounding
+        off = (given - count).abs() > 8 * torch.finfo(self._state.dtype).eps * count.clamp(min=1.0)
+        wrong = given[~((count >= 0) & ~off & count.isfinite())]
         if wrong.numel():
             raise RuleError(
-                f"binomial was given the number {wrong[0]:g}: it must be whole, 0 or more"
+                f"binomial was given the number {float(wrong[0])}: it must be whole, 0 or more"
             )
         return binomial(count, _probability("binomial", probability, drawn), drawn)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass
 
@@ -35,7 +36,7 @@ class Measured(Target):
 
     smooth: say True where the functions have derivatives by all that the parameters change, as
     means of levels have, and counts of cells do not: then least squares search with exact
-    derivatives, where the scene has them. Where a function has none, they are wrong in silence.
+    derivatives, where the scene has them. A measure that gives no gradient at all is found out.
 
     time: h, when the values were measured, at which colonies then end. Measures of several times
     make a course: `ObservedCourse([Measured(…, time=1.0), Measured(…, time=2.0)])`.
@@ -95,7 +96,17 @@ class Measured(Target):
         return [f"{names} is not a number" if names else late for names in why]
 
     def why_rough(self, state: tf.State) -> str:
-        return "" if self.smooth else "measures of your own may pass no gradient (smooth=True)"
+        if not self.smooth:
+            return "measures of your own may pass no gradient (smooth=True)"
+        with torch.enable_grad():
+            each = {
+                n: x.detach().clone().requires_grad_()
+                for n, x in state.fields.items() if x.is_floating_point()
+            }  # fmt: skip
+            moved = state.with_fields(**each)
+            lacking = [n for n, x in self.functions.items() if not _has_gradient(x, moved)]
+        names = " and ".join(map(repr, lacking))
+        return f"no gradient passes through {names} of Measured" if lacking else ""
 
     def found(self, state: tf.State) -> Tensor:
         """The measures of each colony, (B, K) float64, with their gradients."""
@@ -172,3 +183,13 @@ def _words(low: float, high: float) -> str:
     if math.isinf(low) or math.isinf(high):
         return f"≥ {low:g}" if math.isinf(high) else f"≤ {high:g}"
     return f"{low:g} to {high:g}"
+
+
+def _has_gradient(measure: Measure, tracked: tf.State) -> bool:
+    """Whether a measure of a state whose fields require a gradient requires one."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch's, of float(x)
+            return bool(measure(tracked).requires_grad)
+    except RuntimeError:  # as where it asks for NumPy's numbers
+        return False

@@ -9,7 +9,7 @@ import torch
 from searching import lit
 
 import torchfilm as tf
-from design import Local, Measured, Parameter, Search, Sobol, Task, Weighted
+from design import Local, Measured, ObservedCourse, Parameter, Search, Sobol, Task, Weighted
 from design.objective import Objective
 from design.saved_design import load_design
 
@@ -170,3 +170,53 @@ def test_a_number_for_each_cell_is_no_failed_design():
     search = Search(lit, [Parameter("make", 0.1, 10.0)], target, cells=6, replicates=2)
     with pytest.raises(TypeError, match=r"functions\['level'\] gave .*one number for each colony"):
         search.run(colonies=8, progress=False)
+
+
+def _averaged(state):
+    return state.groups.sum(state.g) / state.counts
+
+
+def _brightest(state):
+    return state.groups.max(state.g)
+
+
+def _through_numbers(state):
+    return torch.tensor([float(x.mean()) for x in state.g.split(state.counts.tolist())])
+
+
+def _through_numpy(state):
+    means = [x.numpy().mean() for x in state.g.split(state.counts.tolist())]
+    return torch.tensor(np.array(means))
+
+
+def _cells(state):
+    return state.counts.double()
+
+
+@pytest.mark.parametrize("course", [False, True])
+@pytest.mark.parametrize(
+    ("measure", "lacking"),
+    [
+        (_averaged, False), (_brightest, False), (_through_numbers, True),
+        (_through_numpy, True), (_cells, True),
+    ],
+)  # fmt: skip
+def test_smooth_measures_that_pass_no_gradient_are_found_out(measure, lacking, course):
+    """They had slopes of 0, in silence. Then derivatives are differences, and say so."""
+    options = {"times": [0.1, 0.3], "values": {"m": [0.1, 0.3]}, "spread": {"m": 0.1}}
+    target = (
+        ObservedCourse.of_measures({"m": measure}, smooth=True, **options) if course
+        else Measured({"m": measure}, {"m": 0.3}, {"m": 0.1}, smooth=True)
+    )  # fmt: skip
+
+    def colony(make=1.0):
+        circuit = tf.Circuit(lambda u, s, p, c: {"g": p.make - u.g}, species="g", make=make)
+        return tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.0), circuit, dim=2, dt=0.1)
+
+    task = Task(
+        colony, [Parameter("make", 0.1, 10.0)], target, until=0.3, replicates=1, seed=0,
+        dtype=torch.float64,
+    )  # fmt: skip
+    assert bool(task.why_rough) == lacking
+    if lacking:
+        assert "no gradient passes through 'm' of Measured" in task.why_rough

@@ -243,7 +243,7 @@ class CircuitGraph:
         check = np.concatenate([self._at_random(2, 0.2, 2.0), far])
         still = [{n: 1} for n in self.species if n not in self.rates]
         found = []
-        for weights in _null_space(near if len(near) else far):
+        for weights in null_space(near if len(near) else far):
             parts = check * np.array(weights)
             # relative to what cancels, so that slow reactions count beside fast ones
             if len(parts) and (np.abs(parts.sum(1)) <= 1e-12 * np.abs(parts).max(1)).all():
@@ -348,7 +348,7 @@ OPERATIONS: dict[str, Callable[..., Tensor]] = {
 }
 
 
-def _null_space(rates: np.ndarray) -> list[list[int]]:
+def null_space(rates: np.ndarray) -> list[list[int]]:
     """Whole numbers w with rates @ w = 0, a basis: (K, n) -> vectors of n."""
     if rates.size == 0:
         return []

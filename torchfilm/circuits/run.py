@@ -25,6 +25,7 @@ from torchfilm.circuits.compiled_molecules import CompiledMolecules
 from torchfilm.circuits.compiled_stiff import CompiledStiff
 from torchfilm.circuits.draws import Draw, KeyedDraws
 from torchfilm.circuits.graph import both_of, check_returned
+from torchfilm.circuits.molecules import whole
 from torchfilm.circuits.names import Names, unknown, without_medium
 from torchfilm.circuits.network import Network
 from torchfilm.tools.checks import InputError
@@ -294,7 +295,11 @@ def _molecules(
     network, rows = circuit.part, circuit.rows
     volume = circuit.names(concentrations, rows)[3].volume.double()
     molecules_per_unit = circuit.per_unit(settings.molecules_per_unit)
-    parts = [torch.round(concentrations.double() * (volume * molecules_per_unit).unsqueeze(1))]
+    amounts = concentrations.double() * (volume * molecules_per_unit).unsqueeze(1)
+    # others, as rules, may have written what is no whole number
+    everyone = torch.arange(len(rows), device=rows.device)
+    uniform = lambda: draw(everyone, 0, "whole molecules", amounts.shape[1]).T
+    parts = [whole(amounts, uniform, concentrations.dtype)]
     pool = None
     if network.signals:
         assert circuit.pool is not None

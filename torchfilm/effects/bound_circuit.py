@@ -25,7 +25,8 @@ from torchfilm.circuits.tracing import Untraceable
 from torchfilm.circuits.trial import try_circuit
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.circuit_cells import Kind, cell_column, cell_names, cells_of_type
-from torchfilm.effects.circuit_checks import check_read
+from torchfilm.effects.circuit_checks import check_read, warn_of_gradients
+from torchfilm.effects.circuit_daughters import single_genes, warn_of_lost_genes
 from torchfilm.effects.circuit_kernels import CircuitKernels, PreparedStep, Taken
 from torchfilm.effects.circuit_report import Failures
 from torchfilm.effects.circuit_words import methods_of, together_lines
@@ -36,7 +37,6 @@ from torchfilm.state import OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import why_torch
 from torchfilm.tools.tangents import outside_checkpoints, scaled
-from torchfilm.tools.warn_once import warn
 
 if TYPE_CHECKING:
     from torchfilm.effects.circuit import Circuit
@@ -65,6 +65,7 @@ class BoundCircuit(BoundEffect):
             self.values = Values({n: self.values[n].needed_by(kinds) for n in self.values})
         self.rates = snapshot(effect.rates, "Circuit.rates", binding.batch)
         self.networks: dict[Kind, run.Network] = {}
+        self.genes: list[tuple[str, ...]] = []  # of which a division leaves some cells without
         self.exchanged: dict[Kind, tuple[str, ...]] = {}
         # by cell type and form of exchange: the compiled circuit, or why there is none
         self.compiled: dict[tuple[Kind, str], Compiled | str] = {}
@@ -100,10 +101,10 @@ class BoundCircuit(BoundEffect):
 
     def trace(self, state: State) -> State:
         """Build the networks, and try each rate function on a few cells."""
-        if state.step == 0:
-            state = self.ready(state)
         if state.cells == 0:
             return state
+        if state.step == 0:
+            state = self.ready(state)
         given, state = state, state.replace(dt=self.binding.dt)
         circuit, signals = self.effect, tuple(state.signals)
         self.networks = {
@@ -113,6 +114,8 @@ class BoundCircuit(BoundEffect):
         }
         for made in self.networks.values():
             made.check_parameters("Circuit", circuit.parameters)
+        if circuit.is_stochastic and state.step == 0:
+            self.genes = single_genes(self, state)
         named = [n for made in self.networks.values() for n in made.parameters]
         seen: dict[str, set[str]] = {"s": set(), "cell": set(), "p": set(named)}
         contact = state.contact()
@@ -133,11 +136,7 @@ class BoundCircuit(BoundEffect):
                 circuit.atol if circuit.method == "rosenbrock" else None,
             )
         check_read(circuit, seen["p"])
-        if circuit.is_stochastic and self.values.requires_grad:
-            warn(
-                f"Circuit.method = {circuit.method!r} passes no gradient on: numbers of molecules"
-                " are whole. Its constants require one; detach them, or take the default method."
-            )
+        warn_of_gradients(circuit, self.networks.values(), self.values.requires_grad)
         self.exchanged = exchanged
         of_networks = [n for made in self.networks.values() for n in made.signals]
         self.signals = tuple(
@@ -237,6 +236,8 @@ class BoundCircuit(BoundEffect):
         together, circuit = self.plan.transport, self.effect
         dt /= together.medium.steps if together else self.plan.turns
         warn_of_steps(circuit.value_owner(), circuit.parameters, dt, late=0.5)
+        for names in self.genes if divides else ():
+            warn_of_lost_genes(circuit.value_owner(), names)
 
     @property
     def why_turns(self) -> str:

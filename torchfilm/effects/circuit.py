@@ -12,13 +12,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor
-
 from torchfilm.circuits import run
 from torchfilm.circuits.graph import CircuitGraph, graph_of
 from torchfilm.circuits.names import label_of
-from torchfilm.circuits.partition import binomial
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.circuits.tracing import Untraceable
 from torchfilm.effect import CIRCUIT, Binding, BoundEffect, Effect
@@ -31,6 +27,7 @@ from torchfilm.effects.circuit_checks import (
     check_initial,
     check_method,
     check_rates,
+    check_replicated,
     check_species,
     diluted_names,
     equations_of,
@@ -40,8 +37,8 @@ from torchfilm.effects.circuit_checks import (
     no_cells_of,
     shared_fields,
 )
+from torchfilm.effects.circuit_daughters import EACH_CELL, First, volume_of
 from torchfilm.parameters import shorten
-from torchfilm.resolver import Values
 from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.backends import check_backend
@@ -52,7 +49,6 @@ Part = run.RateFunction | Sequence[Reaction | Sequence[Reaction]]
 
 EVERY = "every cell"  # where a circuit runs that is not given by type
 POSITIVE = dataclasses.replace(CONSTANT, least=0.0)
-EACH_CELL = "initial[{!r}]"  # by which name the first value of a species is resolved
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -68,7 +64,9 @@ class Circuit(Effect):
     reactions and parts. Or a dict of either by cell type, {0: …, 1: …}: other types have no
     reactions. species: names. initial: concentrations at the start by name, 0 without. daughters:
     "concentration", they have their parent's (the paper's way; the two new caps make both together
-    smaller than it was), "amount", its molecules are shared by volume and none is lost. method:
+    smaller than it was), "amount", its molecules are shared by volume and none is lost. replicated:
+    names of species of which each daughter has as many molecules as the parent, as of genes, which
+    are replicated before a division. method:
     "rosenbrock" (stiff, adaptive for each cell), "euler", "midpoint", "heun2", "heun3", "rk4"
     (`steps` equal steps), or for reactions "tau_leap" or "direct": molecule by molecule,
     `molecules_per_unit` of them in a unit of concentration × µm³ (0.6022 for nM). rtol, atol: of
@@ -87,6 +85,7 @@ class Circuit(Effect):
     species: tuple[str, ...]
     initial: Mapping[str, Value] = field(default_factory=dict)
     daughters: str = "concentration"
+    replicated: tuple[str, ...] = ()
     method: str = STIFF
     steps: int = 1
     rtol: float = 1e-4
@@ -107,6 +106,7 @@ class Circuit(Effect):
         species: Sequence[str],
         initial: Mapping[str, Value] | None = None,
         daughters: str = "concentration",
+        replicated: Sequence[str] = (),
         method: str = STIFF,
         steps: int = 1,
         rtol: float = 1e-4,
@@ -141,8 +141,9 @@ class Circuit(Effect):
             "name": name,
             "shared": others,
             "backend": backend,
-            "dilution": diluted_names(dilution, names, method),
+            "dilution": (diluted := diluted_names(dilution, names, method)),
             "daughters": daughters,
+            "replicated": check_replicated(replicated, names, diluted),
             "method": method,
             "steps": int(steps),
             "initial": {
@@ -331,20 +332,21 @@ class Circuit(Effect):
         return found | {n: (v, CONSTANT) for n, v in self.parameters.items()}
 
     def declares(self, dim: int) -> tuple[Field, ...]:
-        again = self.diluted_fields if self.resets else ()
+        of_genes = tuple(self.variables[n] for n in self.replicated)
+        again = self.diluted_fields if self.resets else of_genes
         fields = [
             Field(
                 self.variables[n],
                 "concentration in the cell",
                 CONCENTRATION,
-                initial=_First(self, n),
+                initial=First(self, n),
                 at_division="reset" if self.variables[n] in again else "copy",
             )
             for n in self.species
         ]
         name, meaning = self.volume_field, "volume that the concentrations refer to"
         fields.append(
-            Field(name, meaning, "µm³", initial=_volume_of, at_division="reset", internal=True)
+            Field(name, meaning, "µm³", initial=volume_of, at_division="reset", internal=True)
         )
         return (*fields, CELL_TYPE) if EVERY not in self.rates else tuple(fields)
 
@@ -406,35 +408,3 @@ OPTION_NAMES = tuple(
     n for n in inspect.signature(Circuit.__init__).parameters
     if n not in ("self", "rates", "species", "initial", "dilution", "parameters")
 )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class _First:
-    """Concentrations (M,) of new cells: at the start as `initial` says, of daughters as `daughters`
-    says."""
-
-    circuit: Circuit
-    species: str
-
-    def __call__(self, state: State, rows: Tensor, values: Values) -> Tensor:
-        circuit, name = self.circuit, self.species
-        if not state.births:
-            first = values[EACH_CELL.format(name)]
-            return first.of_rows(state, rows, f"Circuit.{circuit.variables[name]}")
-        births, own = state.births[-1], circuit.variables[name]
-        amount = births.parents.fields[own] * births.parents.fields[circuit.volume_field]
-        volumes = [state.volume.index_select(0, r) for r in (births.first, births.second)]
-        share = volumes[0] / (volumes[0] + volumes[1])
-        if not circuit.is_stochastic:
-            return torch.cat([amount * share / volumes[0], amount * (1 - share) / volumes[1]])
-        per_unit = values.molecules_per_unit.of_cells(births.parents)
-        count = torch.round(amount * per_unit)
-        everyone = torch.arange(count.numel(), device=count.device)
-        taken = binomial(count, share, births.parents.uniform(everyone, f"partition {own}"))
-        return torch.cat(
-            [taken / (volumes[0] * per_unit), (count - taken) / (volumes[1] * per_unit)]
-        )
-
-
-def _volume_of(state: State, rows: Tensor, values: Values) -> Tensor:
-    return state.volume.index_select(0, rows)

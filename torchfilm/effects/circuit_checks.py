@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from numbers import Integral
 from typing import Any
+
+from torch import Tensor
 
 from torchfilm.circuits import integrators
 from torchfilm.circuits.names import unknown
@@ -178,6 +180,34 @@ def diluted_names(
             "Circuit.dilution", given, "True where molecules are counted", "Their number is kept."
         )
     return given
+
+
+def check_replicated(
+    given: Sequence[str], species: Sequence[str], diluted: bool | tuple[str, ...]
+) -> tuple[str, ...]:
+    """The option `replicated`: names of species of which each daughter has its parent's number."""
+    names = tuple(dict.fromkeys((given,) if isinstance(given, str) else given))
+    for name in names:
+        if name not in species:
+            what = f"Circuit.replicated names {name!r}, which is no species"
+            raise checks.InputError(unknown(what, name, species))
+        if diluted is not True and name not in (diluted or ()):
+            rule = f"of species whose amounts stay as cells grow: {name!r} is not diluted"
+            raise checks.input_error("Circuit.replicated", names, rule, "Add it to dilution.")
+    return names
+
+
+def warn_of_gradients(circuit: Any, networks: Iterable[Any], tracked: bool) -> None:
+    """Warn where molecules are counted and a gradient is wanted: by values, `tracked`, or by rates
+    of reactions."""
+    rates = [x.rate for network in networks for x in network.reactions]
+    tracked |= any(isinstance(x, Tensor) and x.requires_grad for x in rates)
+    if circuit.is_stochastic and tracked:
+        warn(
+            f"Circuit.method = {circuit.method!r} passes no gradient on: numbers of molecules are"
+            " whole. Its constants or first values require one; detach them, or take the default"
+            " method."
+        )
 
 
 def check_read(circuit: Any, read: set[str]) -> None:

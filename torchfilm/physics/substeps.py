@@ -40,7 +40,7 @@ def substeps(
     broken = groups.any(~torch.isfinite(every).all(1))
     drags = torch.stack([x.to(length.dtype) for x in (viscosity, length_drag)])
     no_drag = groups.any(~(torch.isfinite(drags) & (drags > 0)).all(0))
-    steps = torch.ceil(groups.max(elongation).double() / longest * (1 - ROUNDING))
+    steps = torch.ceil(groups.max(elongation.detach()).double() / longest * (1 - ROUNDING))
     status = torch.where(steps > MOST_SUBSTEPS, TOO_FAST, CONVERGED)
     status = torch.where(broken, NOT_FINITE, status)
     status = torch.where(no_drag, BAD_DRAG, status)

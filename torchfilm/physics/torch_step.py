@@ -11,8 +11,6 @@ from torchfilm.physics import bilateral, one_sided
 from torchfilm.physics.contact_records import ContactReport, ContactSettings
 from torchfilm.physics.step_records import MechanicsInput, MechanicsResult, StepInput, StepResult
 from torchfilm.physics.substeps import substeps
-from torchfilm.tools.ragged import Groups
-from torchfilm.tools.tangents import tracked
 
 
 def step(given: MechanicsInput) -> MechanicsResult:
@@ -57,7 +55,7 @@ def _contacts(
         hardness = torch.zeros_like(steps, dtype=torch.float64)
         alpha = PENALTY / drags[1] if alpha is None else alpha
     else:
-        hardness = _of_colonies(given.contact_alpha, given.groups).double()
+        hardness = given.groups.max(given.contact_alpha).double()
         left = COMPRESSION * (base + 2 * given.radius) - given.compression
         shortest = (base - left.clamp(min=0.0)).clamp(min=0.0)
     walls: list[tuple[str, Tensor | None]] = []
@@ -71,16 +69,6 @@ def _contacts(
         given.groups.spread(given.colony_id), given.surfaces, walls, shortest,
         None if given.bonds is None else given.bonds.over(own_dt), given.drift,
     )  # fmt: skip
-
-
-def _of_colonies(value: Tensor, groups: Groups) -> Tensor:
-    """The greatest value in each colony, (N,) -> (B,), with its gradient; 0 without cells."""
-    most = groups.max(value)
-    if not tracked(value):
-        return most
-    place = torch.arange(value.numel(), device=value.device)
-    first = groups.max(torch.where(value.detach() == most[groups.owner], place, -1), -1)
-    return torch.where(first < 0, most, value.index_select(0, first.clamp(min=0)))
 
 
 def _collapsed_steps(given: MechanicsInput, found: StepResult) -> Tensor:

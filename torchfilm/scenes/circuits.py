@@ -84,6 +84,7 @@ def repressilator(
             reactions,
             species=(*names, *(f"m_{n}" for n in names)),
             method="tau_leap" if noise else "rosenbrock",
+            daughters="amount",  # as molecules are shared
             molecules_per_unit=molecules_per_unit,
             initial={"laci": 20.0, "m_laci": 20.0},
             production=alpha * speed,
@@ -127,6 +128,7 @@ def toggle_switch(
             reactions,
             species=("red", "green"),
             method="tau_leap" if noise else "rosenbrock",
+            daughters="amount",  # as molecules are shared
             molecules_per_unit=molecules_per_unit,
             initial={"red": start, "green": start},
             production=strength * speed,

@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.tools.tangents import tracked
 from torchfilm.tools.threads import one_torch_thread
 
 # The rows that one thread adds up in a sum over groups on CUDA.
@@ -208,8 +209,11 @@ class Groups:
     def max(self, value: Tensor, empty: float = 0.0) -> Tensor:
         """The maximum of each group, (K,) -> (size,); `empty` where a group has no row.
 
-        It is exact, so the order of rows has no effect. No gradient.
+        It is exact, so the order of rows has no effect. Its derivatives are those of the first row
+        that has it.
         """
+        if tracked(value):
+            return self._tracked_max(value, empty)
         value = value.detach()
         if self.size == 1 and value.numel():
             return value.amax(0, keepdim=True)
@@ -221,6 +225,11 @@ class Groups:
         start = self.order[0].long()
         out = torch.segment_reduce(self._sorted(of_kind), "max", offsets=start, unsafe=True)
         return torch.where(self.counts == 0, empty, out).to(value.dtype)
+
+    def _tracked_max(self, value: Tensor, empty: float) -> Tensor:
+        most = self.max(value.detach(), empty)
+        row, known = self.first(value.detach() == most.index_select(0, self.owner))
+        return torch.where(known, value.index_select(0, row), most) if value.numel() else most
 
     def first(self, flag: Tensor) -> tuple[Tensor, Tensor]:
         """The place of the first flagged element of each group, (N,) bool -> (G,); and whether

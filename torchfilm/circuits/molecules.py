@@ -1,0 +1,26 @@
+"""Whole numbers of molecules."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+# Units in the last place by which a number of molecules may be off a whole one: it is a
+# concentration times a volume, both rounded.
+ROUNDED = 8
+
+
+def whole(
+    amount: Tensor, uniform: Callable[[], Tensor], dtype: torch.dtype | None = None
+) -> Tensor:
+    """Whole numbers of molecules: the nearest where an amount is one but for the rounding of
+    `dtype`, by default its own; else rounded up or down at random, so that the mean stays.
+    uniform: draws, of the shape of the amounts."""
+    near = torch.round(amount)
+    eps = torch.finfo(dtype or amount.dtype).eps
+    off = (amount - near).abs() > ROUNDED * eps * amount.abs().clamp(min=1.0)
+    if off.device.type == "cpu" and not bool(off.any()):
+        return near
+    return torch.where(off, torch.floor(amount + uniform().to(amount.dtype)), near)
