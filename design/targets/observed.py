@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import Target, ended_elsewhere, require, species_names
+from design.targets.base import Target, ended_elsewhere, require
+from design.targets.observed_like import counted, named, shared_plan, with_caps
 from design.targets.observed_masks import masks_table
 from design.targets.observed_table import read_table, warn_of_empty
 from design.targets.statistics import (
@@ -99,6 +100,7 @@ class Observed(Target):
         columns: Mapping[str, str] | None = None,
         length_with_caps: bool = False,
         relative: bool = False,
+        amounts: bool = False,
         quantiles: bool = False,
         rings: int = 4,
         reach: float = 3.0,
@@ -116,9 +118,10 @@ class Observed(Target):
         or "min".
 
         length_with_caps: lengths include the caps, as masks measure them. relative: levels count
-        relative to their mean in the colony, for a reporter in arbitrary units. quantiles: those
-        of each reporter are compared, too, as where cells are in two states. rings: how many, out
-        to where 95 % of the cells are. reach: µm; cells with closer centres are neighbours.
+        relative to their mean in the colony, for a reporter in arbitrary units. amounts: levels are
+        those of whole cells, concentration × volume, as a flow cytometer measures them. quantiles:
+        those of each reporter are compared, too, as where cells are in two states. rings: how many,
+        out to where 95 % of the cells are. reach: µm; cells with closer centres are neighbours.
         time: h, when the colonies were observed. like: another `Observed`, whose rings and options
         are taken, so that both compare the same statistics; and its species, where none are given.
 
@@ -127,11 +130,14 @@ class Observed(Target):
         Raises InputError for a table without units or with several frames, a column that is
         missing or not numbers, negative lengths and ages, and arguments that nothing uses.
         """
-        names = _names(species, like)
+        names = named(species, like)
         units = tf.tables.Units(pixel_size, length_unit, angle_unit, time_unit)
         cells = read_table(table, names, units, columns or {}, length_with_caps)
-        plan = known_statistics(cells, names, rings, reach, length_with_caps, relative, quantiles)
-        return _observed(cells, plan if like is None else _shared(plan, like), time)
+        plan = known_statistics(
+            cells, names, rings, reach, length_with_caps, relative, quantiles,
+            counted(amounts, like),
+        )  # fmt: skip
+        return _observed(cells, plan if like is None else shared_plan(plan, like), time)
 
     @staticmethod
     @checks.known_keywords
@@ -146,6 +152,7 @@ class Observed(Target):
         drop: str | Sequence[str] = (),
         least_area: int = 30,
         relative: bool = False,
+        amounts: bool = False,
         quantiles: bool = False,
         rings: int = 4,
         reach: float = 3.0,
@@ -161,16 +168,16 @@ class Observed(Target):
         `Cells.from_masks`, which reads each of them. Lengths are those of the centreline. Else as
         `from_table`. Raises InputError for what these two refuse, and for lists of other lengths.
         """
-        caps = _caps(False, like)
+        caps, amounts = with_caps(False, like), counted(amounts, like)
         table = masks_table(
-            masks, fluorescence, caps, pixel_size=pixel_size, background=background, frame=frame,
-            drop=drop, least_area=least_area,
+            masks, fluorescence, caps, amounts, pixel_size=pixel_size, background=background,
+            frame=frame, drop=drop, least_area=least_area,
         )  # fmt: skip
         if species is None:
             species = tuple(fluorescence or ()) if like is None else like.plan.species
         return Observed.from_table(
-            table, species=species, length_with_caps=caps, relative=relative, quantiles=quantiles,
-            rings=rings, reach=reach, time=time, like=like,
+            table, species=species, length_with_caps=caps, relative=relative, amounts=amounts,
+            quantiles=quantiles, rings=rings, reach=reach, time=time, like=like,
         )  # fmt: skip
 
     @staticmethod
@@ -182,6 +189,7 @@ class Observed(Target):
         history: Tensor | None = None,
         length_with_caps: bool = False,
         relative: bool = False,
+        amounts: bool = False,
         quantiles: bool = False,
         rings: int = 4,
         reach: float = 3.0,
@@ -189,7 +197,7 @@ class Observed(Target):
     ) -> Observed:
         """The target of the colonies of a state, each a replicate. history: the notes of
         `Observed.note` after every step, for ages. Else as `from_table`."""
-        names = _names(species, like)
+        names = named(species, like)
         if not isinstance(state, tf.State):
             raise checks.input_error("Observed.from_state(state)", state, "a tf.State")
         require(state, names)
@@ -202,14 +210,16 @@ class Observed(Target):
         if not isinstance(history, Tensor | None):
             rule = "the notes of Observed.note after every step, stacked, or None"
             raise checks.input_error("Observed.from_state(history)", history, rule)
-        length_with_caps = _caps(length_with_caps, like)
+        length_with_caps, amounts = with_caps(length_with_caps, like), counted(amounts, like)
         whole = ColonyStatistics(
             True, history is not None, True, True, names, (0.0, 1.0), 1.0, length_with_caps,
-            relative,
+            relative, amounts=amounts,
         )  # fmt: skip
         cells = seen_cells(state, whole, history)
-        plan = known_statistics(cells, names, rings, reach, length_with_caps, relative, quantiles)
-        plan = plan if like is None else _shared(plan, like)
+        plan = known_statistics(
+            cells, names, rings, reach, length_with_caps, relative, quantiles, amounts
+        )
+        plan = plan if like is None else shared_plan(plan, like)
         return _observed(cells, plan, state.time or None)
 
     @staticmethod
@@ -221,6 +231,7 @@ class Observed(Target):
         species: Sequence[str] = (),
         length_with_caps: bool = False,
         relative: bool = False,
+        amounts: bool = False,
         quantiles: bool = False,
         rings: int = 4,
         reach: float = 3.0,
@@ -228,10 +239,11 @@ class Observed(Target):
     ) -> Observed:
         """The target of a frame of a results file, with the ages of its cells. Else as
         `from_table`."""
-        length_with_caps = _caps(length_with_caps, like)
+        length_with_caps, amounts = with_caps(length_with_caps, like), counted(amounts, like)
         with tf.Results(path) as results:
             table, now = results.table(frame), float(results.times[frame])
             warn_of_empty(results, table)
+        size = table["volume"] if amounts else 1.0
         columns = {
             "colony": table["colony"],
             "x_um": table["x"],
@@ -239,11 +251,12 @@ class Observed(Target):
             "length_um": table["length"] + (2.0 * table["radius"] if length_with_caps else 0.0),
             "angle_rad": table["angle"],
             "age_h": table["age"],
-            **{name: table[name] for name in _names(species, like) if name in table},
+            **{n: table[n] * size for n in named(species, like) if n in table},
         }
         return Observed.from_table(
             columns, species=species, length_with_caps=length_with_caps, relative=relative,
-            quantiles=quantiles, rings=rings, reach=reach, time=now or None, like=like,
+            amounts=amounts, quantiles=quantiles, rings=rings, reach=reach, time=now or None,
+            like=like,
         )  # fmt: skip
 
     @property
@@ -349,41 +362,6 @@ class Observed(Target):
         many = f"{self.colonies} observed colon" + ("ies" if self.colonies > 1 else "y")
         when = "" if self.time is None else f" at {self.time:g} h"
         return f"like {many}{when}, {self.cells} cells: {', '.join(self.plan.groups)}"
-
-
-def _names(species: Sequence[str], like: Observed | None) -> tuple[str, ...]:
-    """The species that are compared: those given, or those of `like`."""
-    _check_like(like)
-    if species:
-        return species_names("Observed.species", species)
-    return () if like is None else like.plan.species
-
-
-def _check_like(like: object) -> None:
-    if not isinstance(getattr(like, "plan", like), ColonyStatistics | None):
-        raise checks.input_error("Observed(like)", like, "another Observed, or None")
-
-
-def _caps(length_with_caps: bool, like: Observed | None) -> bool:
-    """Whether lengths include the caps: as given, or as those of `like`."""
-    _check_like(like)
-    return length_with_caps if like is None else like.plan.length_with_caps
-
-
-def _shared(known: ColonyStatistics, like: Observed) -> ColonyStatistics:
-    """The statistics of `like`. known: those that the data have. Raises InputError where they lack
-    one, or have other species."""
-    plan = like.plan
-    if plan.species != known.species:
-        rule = f"that of like, {list(plan.species)}"
-        raise checks.input_error("Observed(species)", list(known.species), rule)
-    for name, group in (("lengths", "length"), ("ages", "age"), ("positions", "extent"),
-                        ("alignment", "alignment")):  # fmt: skip
-        if getattr(plan, name) and not getattr(known, name):
-            rule = f"of statistics that these data have: they have no {name}"
-            hint = "" if name == "positions" else f"Give like=….without({group!r})."
-            raise checks.input_error("Observed(like)", like.describe(), rule, hint)
-    return plan
 
 
 def _observed(cells: SeenCells, plan: ColonyStatistics, time: float | None) -> Observed:

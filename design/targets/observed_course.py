@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from design.targets.measured import Measure, Measured
 from design.targets.observed import FARTHEST, Observed
 from design.targets.observed_measures import MeasureStatistics, ObservedMeasures, as_data
 from design.targets.statistics import LOG_CELLS, ColonyStatistics, birth_note
-from torchfilm import checks
+from torchfilm import checks, tables
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -104,6 +105,53 @@ class ObservedCourse(Observed):
         }
         for name, value in found.items():
             object.__setattr__(self, name, value)
+
+    @staticmethod
+    @checks.known_keywords
+    def from_table(  # type: ignore[override]
+        table: str | Path | Mapping[str, Any],
+        *,
+        time_unit: str | None = None,
+        columns: Mapping[str, str] | None = None,
+        **options: Any,
+    ) -> ObservedCourse:
+        """Cells that were observed at several times: a table as for `Observed.from_table` with a
+        column `time` beside, as time_h or time_min, or with time_unit; columns={"time": "Hours"} if
+        it has another name. The rows of each time are a frame. Further keywords: options of
+        `Observed.from_table`. Raises InputError as that does, and for fewer than two times, or a
+        time of 0 or less."""
+        given, columns = tables.Table.read(table), dict(columns or {})
+        units = tables.Units(time_unit=time_unit)
+        used: set[tuple[str, str]] = set()
+        known = given.quantity("time", "time", columns, units, used)
+        if known is None:
+            hint = 'Name the column of times by columns={"time": …}, or take Observed.from_table.'
+            raise given.missing("time_h", hint)
+        column, _, factor = known
+        age = given.column("age", "time", columns)
+        if age is not None and not age[1]:
+            options["time_unit"] = time_unit
+            used.add(("time", units.stated("time")))
+        units.check_used(used)
+        columns.pop("time", None)
+        times = factor * given.numbers(column)
+        if times.min() <= 0.0:
+            raise tf.InputError(
+                f"{given.place(int(times.argmin()))}, column {column!r}: {times.min():g} h is not"
+                " above 0. Leave such rows out: they say how runs begin, which Scene(founders=…)"
+                " does."
+            )
+        each = np.unique(times)
+        if len(each) < 2:
+            raise tf.InputError(
+                f"{given.source}, column {column!r}: all rows are of {each[0]:g} h, and a course"
+                " has several times. Take Observed.from_table(…, time=…)."
+            )
+        frames = []
+        for t in each:
+            part: Any = given.take(times == t)
+            frames.append(Observed.from_table(part, columns=columns, time=float(t), **options))
+        return ObservedCourse(frames)
 
     @staticmethod
     @checks.known_keywords

@@ -12,12 +12,12 @@ from torchfilm import checks
 
 
 def masks_table(
-    masks: Any, fluorescence: Any, length_with_caps: bool, **options: Any
+    masks: Any, fluorescence: Any, length_with_caps: bool, amounts: bool, **options: Any
 ) -> dict[str, np.ndarray]:
     """The cells of several label images as columns (N,) for `Observed.from_table`.
 
     masks: one, or a list of them, each a colony. fluorescence: by field an image, or a list of as
-    many. options: of `Cells.from_masks`.
+    many. amounts: levels are those of whole cells, mean × area. options: of `Cells.from_masks`.
     """
     several = _listed("masks", masks)
     colonies = masks if several else [masks]
@@ -38,6 +38,10 @@ def masks_table(
                 raise
             raise tf.InputError(f"masks[{k}]: {error}") from error
         part = cells.table()
+        if amounts:
+            length, radius = part["length_um"], part["radius_um"]
+            area = 2.0 * radius * length + np.pi * radius**2
+            part |= {name: part[name] * area for name in images}
         if length_with_caps:
             part["length_um"] = part["length_um"] + 2.0 * part["radius_um"]
         parts.append({**part, "colony": np.full(cells.count, k)})

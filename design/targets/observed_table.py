@@ -62,7 +62,9 @@ def read_table(
     for name in species:
         column = columns.get(name, name)
         if column not in given.columns:
-            raise given.missing(column)
+            hint = "" if name in columns else f'Name yours by columns={{{name!r}: "…"}}.'
+            near = checks.nearest(column, given.columns)
+            raise given.missing(column, f"Did you mean {near!r}? {hint}".strip() if near else hint)
         found[name] = torch.tensor(given.numbers(column))
     if ("x" in found) != ("y" in found):
         raise given.missing("y" if "x" in found else "x")
@@ -120,7 +122,8 @@ def _check_one_time(
             where = "" if owner is None else f" of colony {colony}"
             raise tf.InputError(
                 f"{table.source} has {len(set(own))} times{where} in the column {column!r}, from"
-                f" {own[0]} to {own[-1]}. Colonies are observed at one time: keep the rows of one."
+                f" {own[0]} to {own[-1]}. Observed has colonies of one time: keep the rows of one,"
+                " or take ObservedCourse.from_table."
             )
 
 

@@ -56,7 +56,8 @@ class ColonyStatistics:
     are known. species: reporters. edges: of the rings around the centre of the colony, µm, the
     first 0. reach: cells whose centres are closer are neighbours, µm. length_with_caps: lengths
     include the caps. relative: levels count relative to the mean of their colony. omitted: groups
-    that are left out. quantiles: whether those of levels are compared.
+    that are left out. quantiles: whether those of levels are compared. amounts: levels are those
+    of whole cells, concentration × volume.
     """
 
     lengths: bool
@@ -71,6 +72,7 @@ class ColonyStatistics:
     omitted: tuple[str, ...] = ()
     # not shown: files of simulations know their statistics by name, and older ones have none
     quantiles: bool = field(default=False, repr=False)
+    amounts: bool = field(default=False, repr=False)
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
@@ -90,7 +92,7 @@ class ColonyStatistics:
             found["density"] = tuple(f"density_{k}" for k in rings)
         if self.alignment:
             found["alignment"] = ("alignment",)
-        for name in self.species:
+        for name in (f"{n}_amount" if self.amounts else n for n in self.species):
             if not self.relative:
                 found[name] = (f"{name}_mean",)
             if self.positions:
@@ -187,6 +189,8 @@ def seen_cells(state: tf.State, plan: ColonyStatistics, history: Tensor | None) 
     upright = torch.tensor([1.0, 0.0], dtype=torch.float64, device=flat.device)
     length = state.length.double() + (2.0 * state.radius.double() if plan.length_with_caps else 0.0)
     found = [levels(state, name).double() for name in plan.species]
+    if plan.amounts:
+        found = [x * state.volume.double() for x in found]
     return SeenCells(
         colony=state.colony,
         counts=state.counts,
@@ -276,6 +280,7 @@ def known_statistics(
     length_with_caps: bool,
     relative: bool,
     quantiles: bool,
+    amounts: bool = False,
 ) -> ColonyStatistics:
     """The statistics of all that is known of some cells."""
     checks.integer("Observed(rings)", rings, least=1, most=50)
@@ -301,6 +306,7 @@ def known_statistics(
         length_with_caps=length_with_caps,
         relative=relative,
         quantiles=quantiles,
+        amounts=amounts,
     )
 
 

@@ -111,11 +111,14 @@ class Table:
 
     @staticmethod
     def read(table: Any, source: str = "the table") -> Table:
-        """The table of a CSV file (its path) or of columns by name (a dictionary or DataFrame).
+        """The table of a CSV file (its path) or of columns by name (a dictionary or DataFrame); or
+        a table as it is.
 
         A CSV file is UTF-8, with a header, commas between columns and decimal points. Raises
         InputError for a file that is not, and for columns of unequal length or without rows.
         """
+        if isinstance(table, Table):
+            return table
         if isinstance(table, (str, Path)):
             return _read_csv(Path(table))
         if not hasattr(table, "keys") or not hasattr(table, "__getitem__"):
