@@ -255,6 +255,12 @@ class _Step:
         return found
 
     @property
+    def wanted(self) -> bool:
+        """Whether gradients by a constant of the circuits, or by what there was, are wanted."""
+        constants = any(c.values.requires_grad for c in self.together.circuits)
+        return torch.is_grad_enabled() and (constants or tracked(*self.state.fields.values()))
+
+    @property
     def close(self) -> float:
         """Where the iteration ends."""
         return PART * self.together.rtol
@@ -283,7 +289,7 @@ def _solved(make: Callable[[], _Step]) -> tuple[_Step, Outcome, FixedPoint]:
     step = make()
     if (found := _by_kernels(step, step.close)) is not None:
         return step, *found
-    if not in_forward_mode():
+    if not in_forward_mode() and not step.wanted:  # what rates refer to may be tracked, as networks
         outcome = step(step.start())
         if not outcome.tracked(step.state):
             return step, *_by_torch(step, step.close, outcome)

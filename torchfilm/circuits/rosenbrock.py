@@ -362,8 +362,8 @@ def _merge(
     # the graph must not contain rejected steps: where they are not finite, a zero gradient becomes
     # NaN
     at = torch.nonzero(good).squeeze(1)
-    if at.numel() == 0:
-        return u
+    if at.numel() in (0, good.numel()):
+        return new if at.numel() else u
     taken, _, _ = method.step(
         u.index_select(1, at), rows.index_select(0, at), h.index_select(0, at)
     )

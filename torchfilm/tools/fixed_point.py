@@ -14,7 +14,13 @@ import torch
 from torch import Tensor
 
 from torchfilm.tools.ragged import Groups
-from torchfilm.tools.tangents import both, in_forward_mode, refuse_second, with_tangent
+from torchfilm.tools.tangents import (
+    both,
+    in_forward_mode,
+    may_be_checkpoint,
+    refuse_second,
+    with_tangent,
+)
 from torchfilm.tools.threads import one_torch_thread
 
 DEPTH, WORSE = 3, 4.0
@@ -193,7 +199,9 @@ def with_derivative(
     """The solution x = F(x), (N, …), with the derivative of this equation by all that the function
     depends on: dx = (1 − F′)⁻¹ dF, solved for in the same way. what: it is, in a message."""
     # a tangent of 0, so that compiled functions with derivatives are those of the solve below
-    value = function(with_tangent(x, torch.zeros_like(x)) if in_forward_mode() else x)
+    again = in_forward_mode() or may_be_checkpoint()
+    at = x.detach().requires_grad_(not again)
+    value = function(with_tangent(x, torch.zeros_like(x)) if in_forward_mode() else at)
     moved = both(value)[1]
     if moved is not None:  # F′ of a tangent, and the tangent of F itself, together
         size = _sizes(moved, groups)
@@ -205,16 +213,18 @@ def with_derivative(
     change = value - x
     if not change.requires_grad:
         return x
-    return _Adjoint.apply(change, x, function, groups, (close, most, what))
+    known = None if again else (at, value)
+    return _Adjoint.apply(change, x, function, groups, (close, most, what), known)
 
 
 class _Adjoint(torch.autograd.Function):
     """x, with the derivative (1 − F′)⁻¹ d(change). Its input is the change F(x) − x ≈ 0 at a
-    constant x."""
+    constant x. known: this x, and F of it with its derivative by x, where the graph of that may be
+    used several times; else it is made again."""
 
     @staticmethod
-    def forward(ctx, change: Tensor, x: Tensor, function, groups: Groups, settings) -> Tensor:
-        ctx.function, ctx.groups, ctx.settings = function, groups, settings
+    def forward(ctx, change: Tensor, x: Tensor, function, groups, settings, known) -> Tensor:
+        ctx.function, ctx.groups, ctx.settings, ctx.known = function, groups, settings, known
         ctx.save_for_backward(x)
         return x.clone()
 
@@ -222,9 +232,12 @@ class _Adjoint(torch.autograd.Function):
     def backward(ctx, grad: Tensor):
         close, most, what = ctx.settings
         refuse_second(what)
-        with torch.enable_grad():
-            at = ctx.saved_tensors[0].detach().requires_grad_()
-            value = ctx.function(at)
+        if ctx.known is not None:
+            at, value = ctx.known
+        else:
+            with torch.enable_grad():
+                at = ctx.saved_tensors[0].detach().requires_grad_()
+                value = ctx.function(at)
 
         def pulled(x: Tensor) -> Tensor:
             back = torch.autograd.grad(value, at, x, retain_graph=True, allow_unused=True)[0]
@@ -233,7 +246,7 @@ class _Adjoint(torch.autograd.Function):
         size = _sizes(grad, ctx.groups)
         with one_torch_thread():
             found = fixed_point(pulled, grad, lambda x, new: size, ctx.groups, close, most)
-        return _nan_where(found.failed, found.x, ctx.groups), None, None, None, None
+        return _nan_where(found.failed, found.x, ctx.groups), None, None, None, None, None
 
 
 def _nan_where(failed: Tensor, x: Tensor, groups: Groups) -> Tensor:

@@ -43,6 +43,13 @@ def outside_checkpoints() -> AbstractContextManager[object]:
     return torch.autograd.graph.saved_tensors_hooks(lambda x: x, lambda x: x)
 
 
+def may_be_checkpoint() -> bool:
+    """Whether what torch saves now for a backward pass may be for a checkpoint: then each backward
+    pass inside the backward pass would do the work of the checkpoint once more."""
+    hooks = getattr(torch._C._autograd, "_top_saved_tensors_default_hooks", None)
+    return hooks is None or hooks(True) is not None
+
+
 @contextmanager
 def no_derivatives() -> Iterator[None]:
     """Within it results carry neither gradients nor tangents, and no derivative is wanted."""
