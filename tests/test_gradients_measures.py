@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -95,17 +97,29 @@ def test_measures_pass_gradients(name):
 
 
 def test_tilt_and_depth_in_space_pass_gradients():
-    """By the direction of axes: the derivative of asin, and of the cell that reaches highest."""
-    axes = torch.tensor([[0.8, 0.0, 0.6], [1.0, 0.0, 0.0]], dtype=F64)
-    cells = tf.Cells([[0.0, 0, 0], [5.0, 0, 0.5]], axes, length=2.0)
+    """By the direction of axes, also of a cell that stands upright; and by the cell that reaches
+    highest."""
+    axes = torch.tensor([[0.8, 0.0, 0.6], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=F64)
+    cells = tf.Cells([[0.0, 0, 0], [5.0, 0, 0.5], [9.0, 0, 0]], axes, length=[2.0, 2.0, 0.1])
     state = tf.Scene(tf.Growth(rate=1.0), founders=cells, dim=3).bind(dtype=F64).start()
     axis = state.axis.clone().requires_grad_()
     moved = state.replace(axis=axis)
     tilt = torch.autograd.grad(measure.tilt(moved).sum(), axis)[0]
-    assert tilt[0, 2] == pytest.approx(1 / 0.8)
-    # the first cell's ends are ± 0.6 + r, the other's centre is at 0.5: both ends are the first's
+    assert tilt[0].tolist() == pytest.approx([-0.6, 0.0, 0.8])  # per radian along the circle
+    assert tilt[2].tolist() == [0.0, 0.0, 0.0]
+    assert measure.tilt(state).tolist() == pytest.approx([math.asin(0.6), 0.0, math.pi / 2])
+    # the first cell's ends are ± 0.6 + r, others' centres at 0.5 and 0: both ends are the first's
     depth = torch.autograd.grad(measure.depth(moved).sum(), axis)[0]
-    assert depth[:, 2].tolist() == pytest.approx([2.0, 0.0])
+    assert depth[:, 2].tolist() == pytest.approx([2.0, 0.0, 0.0])
+
+
+def test_a_colony_without_cells_has_no_radius():
+    scene = tf.Scene(tf.Growth(rate=1.0), dim=2)
+    state = scene.bind(2).start()
+    one = state.take(torch.tensor([1]))
+    assert one.counts.tolist() == [0, 1]
+    radius = measure.colony_radius(one)
+    assert bool(radius[0].isnan()) and float(radius[1]) == 0.0
 
 
 def test_one_cell_has_a_radius_of_0_and_a_finite_gradient():

@@ -5,7 +5,7 @@ whether growth can be recorded."""
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -263,3 +263,19 @@ def why_not_replayable(model: Model) -> str:
         if tracked(tensor):
             return f"a derivative by {path} is wanted, which recorded growth does not carry"
     return ""
+
+
+def warn_of_lost_genes(effects: Sequence[BoundEffect]) -> None:
+    """Warn of species of a circuit that a division shares among daughters though there is next to
+    nothing, where no other effect writes them."""
+    for effect in effects:
+        others = {n for e in effects if e is not effect for n in e.writes()}
+        circuit: Any = effect.effect
+        for names in getattr(effect, "genes", ()):
+            if others.isdisjoint(circuit.variables[n] for n in names):
+                warn(
+                    f"{effect.title}: no reaction changes the number of {' + '.join(names)}, cells"
+                    " begin with one or two, and division shares them: soon most cells have none."
+                    " If it is a gene, which cells replicate before they divide, add"
+                    f" replicated={names} to the circuit."
+                )

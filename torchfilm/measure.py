@@ -284,7 +284,8 @@ def tilt(state: State) -> Tensor:
     """Angle between each cell's axis and the x–y plane, (N,) rad, 0 … π/2."""
     if state.dim == 2:
         return torch.zeros_like(state.length)
-    return torch.asin(state.axis[:, 2].abs().clamp(max=1))
+    # not an arc sine, whose slope is infinite where a cell stands upright
+    return torch.atan2(state.axis[:, 2].abs(), safe_norm(state.axis[:, :2].T))
 
 
 @of_a_state

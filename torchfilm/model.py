@@ -212,8 +212,11 @@ class Model:
 
     def check_step(self, dt: float) -> None:
         """Raise InputError for a step that no effect can follow."""
+        divides = any("divide_flag" in e.writes() for e in self.effects)
         for effect in self.effects:
-            effect.check_step(dt, any("divide_flag" in e.writes() for e in self.effects))
+            effect.check_step(dt, divides)
+        if divides:
+            binding_checks.warn_of_lost_genes(self.effects)
 
     def check_end(self, state: State, cells: int | None) -> None:
         """Raise InputError, or warn, if no run from this state would come to `cells` cells; warn if

@@ -191,5 +191,5 @@ def _has_gradient(measure: Measure, tracked: tf.State) -> bool:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch's, of float(x)
             return bool(measure(tracked).requires_grad)
-    except RuntimeError:  # as where it asks for NumPy's numbers
+    except (RuntimeError, TypeError, ValueError):  # as where it asks for NumPy's numbers
         return False

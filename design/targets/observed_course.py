@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -120,6 +121,10 @@ class ObservedCourse(Observed):
         it has another name. The rows of each time are a frame. Further keywords: options of
         `Observed.from_table`. Raises InputError as that does, and for fewer than two times, or a
         time of 0 or less."""
+        if "time" in options:
+            hint = "Times are in the table: columns={'time': …} names their column."
+            what = "ObservedCourse.from_table(time)"
+            raise checks.input_error(what, options["time"], "left out", hint)
         given, columns = tables.Table.read(table), dict(columns or {})
         units = tables.Units(time_unit=time_unit)
         used: set[tuple[str, str]] = set()
@@ -146,6 +151,12 @@ class ObservedCourse(Observed):
             raise tf.InputError(
                 f"{given.source}, column {column!r}: all rows are of {each[0]:g} h, and a course"
                 " has several times. Take Observed.from_table(…, time=…)."
+            )
+        if 2 * len(each) > len(times):
+            warnings.warn(
+                f"{given.source}, column {column!r}: {len(each)} times in {len(times)} rows. Cells"
+                " of one frame have the same time: round those that the instrument noted.",
+                stacklevel=3,
             )
         frames = []
         for t in each:

@@ -15,6 +15,10 @@ def counted(amounts: bool, like: Any) -> bool:
     """Whether amounts of species are compared: as given, or as those of `like`."""
     check_like(like)
     checks.choice("Observed(amounts)", amounts, (True, False))
+    if amounts and like is not None and not like.plan.amounts:
+        raise checks.input_error(
+            "Observed(amounts)", True, "False, as of like", "Make that one by amounts=True, too."
+        )
     return amounts if like is None else like.plan.amounts
 
 

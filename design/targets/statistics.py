@@ -288,8 +288,9 @@ def known_statistics(
     checks.choice("Observed(length_with_caps)", length_with_caps, (True, False))
     checks.choice("Observed(relative)", relative, (True, False))
     checks.choice("Observed(quantiles)", quantiles, (True, False))
-    if quantiles and not species:
-        raise checks.input_error("Observed(quantiles)", True, "with species=(…), of which they are")
+    of_species = {"relative": relative, "amounts": amounts, "quantiles": quantiles}
+    for option in (name for name, given in of_species.items() if given and not species):
+        raise checks.input_error(f"Observed({option})", True, "with species=(…), of which it is")
     edges: tuple[float, ...] = ()
     if cells.position is not None:
         outer = float(np.quantile(from_centre(cells.position, cells).cpu().numpy(), INNER))

@@ -169,5 +169,17 @@ def test_what_to_do_with_names_and_times_of_a_cytometer(seen):
         Observed.from_table(cytometry(seen[1]), species=["gfp"])
     with pytest.raises(tf.InputError, match=r"take ObservedCourse\.from_table"):
         Observed.from_table(at_times(seen), species=["gfp"])
+    with pytest.raises(tf.InputError, match=r"Observed\(amounts\) = True.*as of like"):
+        like = Observed.from_table(flow := {"gfp": amounts(seen[1])}, species=["gfp"])
+        Observed.from_table(flow, species=["gfp"], amounts=True, like=like)
+    with pytest.raises(tf.InputError, match=r"Observed\(amounts\) = True.*with species"):
+        Observed.from_table({"length_um": [2.0, 3.0]}, amounts=True)
+    with pytest.raises(tf.InputError, match=r"from_table\(time\) = 3\.0.*columns="):
+        ObservedCourse.from_table(at_times(seen), species=["gfp"], time=3.0)
+    with pytest.warns(UserWarning, match="4 times in 4 rows"):
+        noted = {"time_h": [1.01, 1.02, 2.01, 2.02], "gfp": [1.0, 2.0, 3.0, 4.0]}
+        ObservedCourse.from_table(noted, species=["gfp"])
+    with pytest.raises(tf.InputError, match="time_unit"):
+        ObservedCourse.from_table(at_times(seen), species=["gfp"], time_unit="h")
     with pytest.raises(tf.InputError, match="amounts"):
         Observed.from_state(seen[1], species=["gfp"], amounts="yes")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import warnings
 
@@ -11,7 +12,9 @@ import torch
 
 import torchfilm as tf
 from torchfilm import Reaction, parts
+from torchfilm.circuits import run
 from torchfilm.circuits.molecules import whole
+from torchfilm.effects import circuit_daughters
 from torchfilm.rule_values import RuleError
 
 VOLUME = math.pi * 0.25 * (2 + 2 / 3)  # of a founder, µm³
@@ -94,6 +97,71 @@ def test_whole_numbers_stay(dtype):
     assert abs(float(found.double().mean()) - 7 - 1 / 3) < 4 * math.sqrt(2 / 9 / len(third))
 
 
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_nothing_is_drawn_where_nobody_writes(monkeypatch, backend, dtype):
+    """Roundings of growth, division and reactions do not count as writes."""
+    monkeypatch.setattr(run, "whole", lambda x, draw, own: whole(x, lambda: pytest.fail("!"), own))
+    monkeypatch.setattr(
+        circuit_daughters, "whole", lambda x, draw: whole(x, lambda: pytest.fail("!"))
+    )
+    circuit = tf.Circuit(
+        [parts.degradation("gfp", 0.3), parts.constitutive("gfp", 3000.0)], species="gfp",
+        method="tau_leap", initial={"gfp": 5000.0}, backend=backend,
+    )  # fmt: skip
+    scene = tf.Scene(tf.Growth(rate=1.5), tf.Division(length=3.0), circuit, dim=2, dt=0.05)
+    *_, last = tf.simulate(scene, scene.bind(2, dtype=dtype).start(), until=2.0)
+    assert last.cells > 20
+
+
+def test_a_rule_that_writes_before_a_division_keeps_the_mean():
+    """A third of a molecule more in each step, and a division in each tenth: 2 · 10/3 molecules in
+    all, of which roundings at divisions took none."""
+
+    def adds(cells):
+        cells.gfp = cells.gfp + 0.03 / cells.volume
+        cells.divide_flag = (cells.length > 0) & (round(cells.time * 10) == 10)
+
+    circuit = tf.Circuit(STILL, species="gfp", method="direct", initial={"gfp": 10.0 / VOLUME})
+    founder = tf.Cells([[0.0, 0]], [[1.0, 0]], length=4.0)
+    scene = tf.Scene(tf.Rules(adds), tf.Division(), circuit, founders=founder, dim=2, dt=0.1)
+    *_, last = tf.simulate(scene, until=2.0, colonies=1000, seed=5)
+    assert last.cells == 2000
+    total = (last.gfp * last.volume).double().sum() / 1000
+    first = 10.0 / VOLUME * math.pi * 0.25 * (4 + 2 / 3)
+    made = 0.03 * (10 + 2 * 10)
+    assert abs(float(total) - first - made) < 4 * math.sqrt(0.25 * 32 / 1000)
+
+
+def test_species_are_shared_independently():
+    still = [parts.degradation(n, 0.0) for n in "ab"]
+    circuit = tf.Circuit(
+        still, species=("a", "b"), method="direct", initial={"a": 40 / VOLUME, "b": 40 / VOLUME}
+    )
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.0), circuit, dim=2, dt=0.05)
+    for last in tf.simulate(scene, until=1.0, colonies=2000, seed=2):
+        if last.cells == 4000:
+            break
+    a, b = ((x * last.volume).double()[::2] for x in (last.a, last.b))
+    assert len(a) == 2000 and float(a.var()) == pytest.approx(10.0, rel=0.15)
+    assert abs(float(torch.corrcoef(torch.stack([a, b]))[0, 1])) < 4 / math.sqrt(2000)
+
+
+def test_the_mean_of_a_switch_does_not_depend_on_noise():
+    """Both ways share amounts at divisions: the smooth run had 5 % less."""
+    means = []
+    for noise in (True, False):
+        ready = tf.scenes.toggle_switch(noise=noise, molecules_per_unit=2000.0)
+        high = [
+            dataclasses.replace(e, initial={"red": 5.0, "green": 0.1})
+            if isinstance(e, tf.Circuit) else e for e in ready.effects
+        ]  # fmt: skip
+        late = [s for s in tf.simulate(ready.replace(*high), until=6.0) if s.time > 4.0]
+        held = [float((s.red * s.volume).sum() / s.volume.sum()) for s in late]
+        means.append(sum(held) / len(held))
+    assert means[0] == pytest.approx(means[1], rel=0.005)
+
+
 TELEGRAPH = [
     Reaction.of("off -> on", 2.0),
     Reaction.of("on -> off", 6.0),
@@ -145,6 +213,36 @@ def test_genes_that_a_division_loses_are_warned_of():
     assert float(genes.sum()) == 4  # one a colony, as ever
 
 
+def test_genes_of_one_type_of_cells_are_seen():
+    """Where few of the founders have it."""
+    founders = tf.Cells(
+        [[4.0 * k, 0.0] for k in range(5)], [[1.0, 0.0]] * 5, cell_type=[1, 0, 0, 0, 0]
+    )
+    circuit = tf.Circuit(
+        {1: TELEGRAPH}, species=("off", "on", "m"), method="direct",
+        initial={"off": {0: 0.0, 1: 1 / VOLUME}},
+    )  # fmt: skip
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Division(length=4.0), circuit, founders=founders, dim=2, dt=0.02
+    )
+    with pytest.warns(UserWarning, match=r"number of off \+ on"):
+        next(tf.simulate(scene, until=0.1))
+
+
+def test_genes_that_a_rule_copies_are_not_warned_of():
+    def copied(parent, d1, d2):
+        for d in (d1, d2):
+            d.on = parent.on * parent.volume / d.volume
+            d.off = parent.off * parent.volume / d.volume
+
+    by_hand = tf.Scene(tf.Rules(None, copied), *telegraph().effects, dim=2, dt=0.02)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        *_, last = tf.simulate(by_hand, until=2.0, colonies=3)
+    genes = (last.off + last.on) * last.volume
+    assert torch.allclose(genes, torch.ones_like(genes), atol=1e-4)
+
+
 def test_many_molecules_or_no_division_are_not_warned_of():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -157,6 +255,9 @@ def test_many_molecules_or_no_division_are_not_warned_of():
     ("options", "match"),
     [
         ({"replicated": "gene"}, "Circuit.replicated names 'gene'"),
+        ({"replicated": 3}, "Circuit.replicated = 3 is not allowed"),
+        ({"replicated": None}, "Circuit.replicated = None is not allowed"),
+        ({"dilution": 3, "method": "rosenbrock"}, "Circuit.dilution = 3 is not allowed"),
         ({"replicated": "on", "method": "rosenbrock", "dilution": False}, "'on' is not diluted"),
         ({"replicated": "on", "method": "rosenbrock", "dilution": ("m",)}, "'on' is not diluted"),
     ],

@@ -19,6 +19,7 @@ from torchfilm.circuits.compiled_step import Surroundings
 from torchfilm.circuits.compiled_stiff import compiled_stiff
 from torchfilm.circuits.dilution import Start, half_way, part_way
 from torchfilm.circuits.draws import KeyedDraws
+from torchfilm.circuits.molecules import whole
 from torchfilm.circuits.names import label_of
 from torchfilm.circuits.network import build_network
 from torchfilm.circuits.tracing import Untraceable
@@ -26,7 +27,7 @@ from torchfilm.circuits.trial import try_circuit
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.circuit_cells import Kind, cell_column, cell_names, cells_of_type
 from torchfilm.effects.circuit_checks import check_read, warn_of_gradients
-from torchfilm.effects.circuit_daughters import single_genes, warn_of_lost_genes
+from torchfilm.effects.circuit_daughters import single_genes
 from torchfilm.effects.circuit_kernels import CircuitKernels, PreparedStep, Taken
 from torchfilm.effects.circuit_report import Failures
 from torchfilm.effects.circuit_words import methods_of, together_lines
@@ -205,8 +206,9 @@ class BoundCircuit(BoundEffect):
         so that the mean stays."""
         rows = torch.arange(state.cells, device=state.device)
         size = state.volume * self.values.molecules_per_unit.of_cells(state)
+        draw = lambda name: state.uniform(rows, f"first {name}")
         found = {
-            n: torch.floor(state.fields[n] * size + state.uniform(rows, f"first {n}")) / size
+            n: whole(state.fields[n] * size, partial(draw, n)) / size
             for n in self.effect.own_fields
         }
         return state.with_fields(**found)
@@ -236,8 +238,6 @@ class BoundCircuit(BoundEffect):
         together, circuit = self.plan.transport, self.effect
         dt /= together.medium.steps if together else self.plan.turns
         warn_of_steps(circuit.value_owner(), circuit.parameters, dt, late=0.5)
-        for names in self.genes if divides else ():
-            warn_of_lost_genes(circuit.value_owner(), names)
 
     @property
     def why_turns(self) -> str:

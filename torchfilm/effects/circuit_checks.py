@@ -164,12 +164,21 @@ def check_method(method: str, steps: int, by_type: Mapping[int | str, Any]) -> N
         )
 
 
+def _some_names(option: str, given: Any) -> tuple[str, ...]:
+    """Names of species, each once, as an option has them. Raises InputError for what is no name."""
+    names = (given,) if isinstance(given, str) else given
+    if not isinstance(names, (tuple, list)) or not all(isinstance(n, str) for n in names):
+        rule = "names of species" + (", True or False" if option == "dilution" else "")
+        raise checks.input_error(f"Circuit.{option}", given, rule)
+    return tuple(dict.fromkeys(names))
+
+
 def diluted_names(
     given: bool | Sequence[str], species: Sequence[str], method: str
 ) -> bool | tuple[str, ...]:
     """The option `dilution`: True, False, or the names of the species that growth dilutes."""
     if not isinstance(given, bool):
-        given = tuple(dict.fromkeys((given,) if isinstance(given, str) else given))
+        given = _some_names("dilution", given)
         for name in given:
             if name not in species:
                 what = f"Circuit.dilution names {name!r}, which is no species"
@@ -186,7 +195,7 @@ def check_replicated(
     given: Sequence[str], species: Sequence[str], diluted: bool | tuple[str, ...]
 ) -> tuple[str, ...]:
     """The option `replicated`: names of species of which each daughter has its parent's number."""
-    names = tuple(dict.fromkeys((given,) if isinstance(given, str) else given))
+    names = _some_names("replicated", given)
     for name in names:
         if name not in species:
             what = f"Circuit.replicated names {name!r}, which is no species"

@@ -12,9 +12,9 @@ from torch import Tensor
 from torchfilm.circuits.graph import null_space
 from torchfilm.circuits.molecules import whole
 from torchfilm.circuits.partition import binomial
+from torchfilm.effects.circuit_cells import cells_of_type
 from torchfilm.resolver import Values
 from torchfilm.state import State
-from torchfilm.tools.warn_once import warn
 
 if TYPE_CHECKING:
     from torchfilm.effects.bound_circuit import BoundCircuit
@@ -38,13 +38,13 @@ class First:
             return first.of_rows(state, rows, f"Circuit.{circuit.variables[name]}")
         births, own = state.births[-1], circuit.variables[name]
         before = births.parents
+        everyone = torch.arange(births.first.numel(), device=state.device)
+        draw = lambda what: before.uniform(everyone, f"{what} {own}")
         amount = before.fields[own] * before.fields[circuit.volume_field]
         volumes = [state.volume.index_select(0, r) for r in (births.first, births.second)]
         per_unit: float | Tensor = 1.0
         if circuit.is_stochastic:
             per_unit = values.molecules_per_unit.of_cells(before)
-            everyone = torch.arange(amount.numel(), device=amount.device)
-            draw = lambda what: before.uniform(everyone, f"{what} {own}")
             amount = whole(amount * per_unit, lambda: draw("whole"))
         if name in circuit.replicated:
             return torch.cat([amount / (v * per_unit) for v in volumes])
@@ -58,28 +58,22 @@ class First:
 
 
 def single_genes(bound: BoundCircuit, state: State) -> list[tuple[str, ...]]:
-    """Species whose sum no reaction changes, of which cells have one molecule or two to begin
-    with, and daughters as chance has it: as of the states of a gene."""
+    """Species whose sum no reaction changes, of which cells that have any have one molecule or two
+    to begin with, and daughters as chance has it: as of the states of a gene."""
     circuit, found = bound.effect, []
     size = state.volume * bound.values.molecules_per_unit.of_cells(state)
-    held = {n: float((state.fields[f] * size).mean()) for n, f in circuit.variables.items()}
-    for network in bound.networks.values():
+    for kind, network in bound.networks.items():
+        rows = cells_of_type(state, kind)
         for weights in null_space(network.stoichiometry.cpu().numpy()):
             names = tuple(n for n, w in zip(network.names, weights, strict=True) if w)
             alike = all(w in (0, 1) for w in weights) and all(n in circuit.species for n in names)
-            count = sum(held.get(n, 0.0) for n in names)
-            if alike and 0.5 < count < 2.5 and not set(names) <= set(circuit.replicated):
+            if not alike or set(names) <= set(circuit.replicated):
+                continue
+            held = sum(state.fields[circuit.variables[n]] * size for n in names)[rows].round()
+            some = held[held > 0]
+            if some.numel() and float(some.mean()) < 2.5:
                 found.append(names)
     return list(dict.fromkeys(found))
-
-
-def warn_of_lost_genes(owner: str, names: tuple[str, ...]) -> None:
-    """Warn of species that a division shares among daughters though there is next to nothing."""
-    warn(
-        f"{owner}: no reaction changes the number of {' + '.join(names)}, cells begin with one or"
-        " two, and division shares them: soon most cells have none. If it is a gene, which cells"
-        f" replicate before they divide, add replicated={names} to the circuit."
-    )
 
 
 def volume_of(state: State, rows: Tensor, values: Values) -> Tensor:
