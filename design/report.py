@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +23,11 @@ WORST = 3  # statistics that a poor fit names
 LARGE = 1e5  # a loss of which decimals say nothing
 LUCKY = 0.8  # of the band on fresh seeds: a search that saw less than this was misled
 SUCCESS = 0.25  # of the loss of the best trivial answer: as in the comparison of methods
+SPREADS = 1.7  # standard errors between a mean and its band of 90 %
+MANY = 1000.0  # a mean over fewer colonies shows that one of them misses constraints
+# Designs of which not all have the same loss by chance: it differs by less than this share of it.
+# (A solver takes other steps where another species changes.)
+ALIKE, DIFFERENT = 8, 1e-3
 FITS = 2.0  # a greater loss is not that of colonies like the observed ones, which is about 1
 NEAR = 0.005  # of a bound, as a share of the range (of its logarithm)
 
@@ -176,8 +183,11 @@ def _warnings(report: SearchReport) -> list[str]:
     answers, lines = trivial_answers(report), []
     if missed := _missed(report):
         lines, answers = [missed], {}
+    elif same := _same_losses(report):
+        return [same]
     if answers:
-        lines = ["without a pattern: " + ", ".join(f"{n} {x:.3f}" for n, x in answers.items())]
+        each = ", ".join(f"{n} {shown_loss(target, x)}" for n, x in answers.items())
+        lines = [f"without a pattern: {each}"]
     least = best_trivial(target, answers)
     loss = best.loss if best.fresh is None else best.fresh.loss  # that of the search is luck, too
     if least and loss >= answers[least]:
@@ -195,16 +205,46 @@ def _warnings(report: SearchReport) -> list[str]:
             "the first guess has a smaller loss on the seeds of the search. If the search did not"
             " grow it to full size, begin another one with it: start=."
         )
-    if best.fresh is not None and best.loss < LUCKY * best.fresh.band[0]:
-        lines.append(
-            f"the {report.task.replicates} seeds of the search were lucky: {best.loss:.4f} there,"
-            f" {best.fresh.loss:.4f} on fresh ones. Such losses mislead a search; give it more"
-            " replicates."
-        )
+    if lucky := _lucky(report):
+        lines.append(lucky)
     bound = [p.name for p in space.parameters if at_bound(p, best.values[p.name])]
     if bound:
         lines.append(f"at a bound: {', '.join(bound)}; better values may lie beyond it.")
     return lines
+
+
+def _same_losses(report: SearchReport) -> str:
+    """That no parameter made a difference; else ""."""
+    each = [e.losses.reshape(len(e.losses), -1) for e in report.study.entries if e.size == 1]
+    seeds = min((x.shape[1] for x in each), default=0)  # a model of the loss may have fewer
+    every = np.concatenate([x[:, :seeds] for x in each]) if each else np.zeros((0, 1))
+    if report.task.goals or len(every) < ALIKE or every.max() >= report.task.target.failed:
+        return ""
+    if (np.ptp(every, axis=0) > DIFFERENT * np.abs(every).max(0)).any():
+        return ""
+    names = " or ".join(report.task.space.names)
+    return (
+        f"all {len(every)} designs have the same loss, {show_loss(report.best.loss)}: nothing that"
+        f" the target reads ({', '.join(report.task.target.names) or 'cells'}) depends on {names}."
+    )
+
+
+def _lucky(report: SearchReport) -> str:
+    """That the seeds of the search gave a smaller loss than others would; else "". Means are
+    compared: the worst of many colonies is worse than that of a few."""
+    best, fresh = report.best, report.best.fresh
+    if fresh is None:
+        return ""
+    here, there, low = best.loss, fresh.loss, fresh.band[0]
+    if report.task.reduce != "mean":
+        here, there = float(np.mean(best.losses)), float(np.mean(fresh.losses))
+        low = there - SPREADS * float(np.std(fresh.losses)) / math.sqrt(len(fresh.losses))
+    if not here < low - (1 - LUCKY) * abs(low):
+        return ""
+    return (
+        f"the {report.task.replicates} seeds of the search were lucky: {here:.4f} there,"
+        f" {there:.4f} on fresh ones. Such losses mislead a search; give it more replicates."
+    )
 
 
 def best_trivial(target: Target, answers: Mapping[str, float]) -> str:
@@ -220,12 +260,26 @@ def _missed(report: SearchReport) -> str:
     losses = best.losses if best.fresh is None else best.fresh.losses
     if not target.bounds or not best.colonies or np.max(losses) < Constrained.BROKEN:
         return ""
-    found = measured(target, best.colonies)
-    each = ", ".join(f"{n} {b}: it has {show_value(found[n])}" for n, b in target.bounds.items())
+    found = each_measured(target, best.colonies)
+    broken = {n: b for n, b in target.bounds.items() if _breaks(b, found[n])} or target.bounds
+    each = ", ".join(f"{n} {b}: it has {show_value(_mean(found[n]))}" for n, b in broken.items())
     return (
-        f"the best design misses the constraints in some colonies ({each} in the mean). Simulate"
-        " more colonies, free more parameters, or loosen the constraints."
+        f"the best design misses constraints ({each} in the mean). Simulate more colonies, free"
+        " more parameters, or loosen the constraints."
     )
+
+
+def _breaks(bound: str, found: Sequence[float]) -> bool:
+    """Whether a colony's measure is beyond a bound, such as "≥ 10", or undefined."""
+    known = re.findall(r"([≥≤]) (\S+?)(?:,|$)", bound)
+    held = {"≥": lambda x, most: x >= most, "≤": lambda x, most: x <= most}
+    return not all(held[sign](x, float(number)) for sign, number in known for x in found)
+
+
+def shown_loss(target: Target, loss: float) -> str:
+    """A loss in words where constraints are missed, in some colonies at least."""
+    missed = target.bounds and loss >= Constrained.BROKEN / MANY
+    return "misses the constraints" if missed else f"{loss:.3f}"
 
 
 def trivial_answers(report: SearchReport) -> dict[str, float]:

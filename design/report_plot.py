@@ -12,7 +12,7 @@ import numpy as np
 import torchfilm as tf
 from design.growing import FinishedColonies
 from design.parameters import Parameter, show_value
-from design.report import SearchReport, best_trivial, trivial_answers
+from design.report import SearchReport, best_trivial, shown_loss, trivial_answers
 from design.targets.base import OUTSIDE, Target, known
 
 if TYPE_CHECKING:
@@ -51,9 +51,10 @@ def draw(report: SearchReport) -> Figure:
     scales: list[Any] = []
     for row, one in enumerate(designs):
         axes = [figure.add_subplot(grid[row, k]) for k in range(columns)]
-        title = f"{one.title}, loss {one.loss:.3f}"
+        title = f"{one.title}, loss {shown_loss(target, one.loss)}"
         if one.fresh is not None:
-            title += f"\n({one.fresh.loss:.3f} on fresh seeds)"  # no wider than a panel
+            again = shown_loss(target, one.fresh.loss)
+            title += f"\n({again} on fresh seeds)"  # no wider than a panel
         scales = _draw_row(axes, grown[row], frames[row], target, size, limits, title) or scales
     bars = [figure.add_subplot(grid[2, k]) for k in range(columns)]
     units = {n: f.unit for d in report.best.colonies for n, f in d.state.declared.items()}

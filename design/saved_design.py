@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -246,9 +247,11 @@ class SavedDesign:
     @cached_property
     def objective(self) -> Objective:
         """The objective that scored it. Raises InputError where the file does not hold the target
-        or the parameters of the search, and they are not given."""
+        or the parameters of the search, and they are not given. Warns where the scene is not the
+        one that was scored."""
         parameters = self._part("parameters", self.given_parameters)
         target = self.target
+        self.scene()
         every, free = self.content["parameters"], (*self._search["names"], *self._under)
         options: dict[str, Any] = {
             "fixed": {name: value for name, value in every.items() if name not in free},
@@ -259,8 +262,14 @@ class SavedDesign:
 
     @property
     def point(self) -> np.ndarray:
-        """The coordinates of its parameters (D,)."""
-        return np.array(self._search["point"])
+        """The coordinates of its parameters (D,): as they were, or those of values that have been
+        edited since."""
+        found, space = np.array(self._search["point"]), self.objective.task.space
+        same = [
+            math.isclose(new, old, rel_tol=1e-12) if isinstance(old, float) else new == old
+            for new, old in ((self.values[n], x) for n, x in space.values(found).items())
+        ]
+        return found if all(same) else space.point(self.values)
 
     @property
     def searched(self) -> np.ndarray:

@@ -47,3 +47,12 @@ def test_start_from_a_label_image(command):
 def test_the_version(command, capsys):
     command("--version")
     assert capsys.readouterr().out == f"torchfilm {tf.__version__}\n"
+
+
+def test_files_with_scenes_of_one_name_have_results_of_their_own(command, tmp_path):
+    """Ready-made ones, too: the second had replaced the first."""
+    ready = "import torchfilm as tf\ndef scene(): return tf.scenes.microcolony()\n"
+    for name in ("one", "other"):
+        (tmp_path / f"{name}.py").write_text(ready, encoding="utf-8")
+        command("run", f"{name}.py", "--until", 0.05, "--no-picture")
+    assert {x.name for x in tmp_path.glob("*.h5")} == {"one.h5", "other.h5"}

@@ -69,7 +69,7 @@ class ProfileTarget(Target):
     """Targets with a target profile m, a number from 0 to 1 for each cell and species.
 
     w is the volume of each cell that counts, y ≥ 0 its level, and `floor` the level from which a
-    cell counts as lit. The loss of a species is
+    cell counts as lit; m below `LEAST` counts as 0. The loss of a species is
 
         L = 1 − (Σ w m y)² / (Σ w m² · (Σ w y² + floor² Σ w m²))
 

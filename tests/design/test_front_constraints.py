@@ -64,10 +64,7 @@ def test_the_report_names_the_constraints_that_the_best_design_misses():
     target = Constrained(Burden(), [Level(wanted=1.0)], at_least={"mean_level": 1e6})
     best = search(0, targets=False, target=target).run(colonies=24, progress=False)
     said = best.table()
-    assert (
-        "the best design misses the constraints in some colonies (mean_level ≥ 1e+06: it has"
-        in said
-    )
+    assert "the best design misses constraints (mean_level ≥ 1e+06: it has" in said
     assert "the pattern is weak" not in said and "found no pattern" not in said
     (row,) = [line for line in said.splitlines() if line.startswith("mean_level ")]
     assert "≥ 1e+06" in row

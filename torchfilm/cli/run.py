@@ -25,7 +25,6 @@ from torchfilm.io.recorder import Recorder
 from torchfilm.io.results import Results
 from torchfilm.loop import LOOK, STILL, Standstill
 from torchfilm.model import Model
-from torchfilm.scene import Scene
 from torchfilm.scenes.recipes import from_plain
 from torchfilm.simulation import simulate
 from torchfilm.state import State
@@ -115,7 +114,7 @@ class Run:
         use_threads(self.threads, model.batch.colonies)
         state = model.start()
         recorder = Recorder(
-            self._results_file(scene, bool(plan)), scene, every=self.every, overwrite=self.overwrite
+            self._results_file(bool(plan)), scene, every=self.every, overwrite=self.overwrite
         )
         if self.picture:
             check_new(
@@ -141,10 +140,11 @@ class Run:
             full=Standstill(DEFAULT_CELLS, STILL - LOOK) if unasked else None,
         )
 
-    def _results_file(self, scene: Scene, is_design: bool) -> Path:
+    def _results_file(self, is_design: bool) -> Path:
         """The path of the results, in a folder that exists: it is made if necessary."""
-        # SCENE.h5 is the usual name of the study that found a design
-        own = Path(f"{Path(self.scene).stem}_run.h5" if is_design else f"{scene.name}.h5")
+        # of a file its own name, as two may have scenes of one name; and SCENE.h5 is the usual name
+        # of the study that found a design
+        own = Path(f"{Path(self.scene).stem}{'_run' if is_design else ''}.h5")
         out = self.out if self.out is not None else own
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
