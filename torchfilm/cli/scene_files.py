@@ -165,7 +165,8 @@ def _call(make: Callable[..., Any], name: str, parameters: dict[str, Any]) -> An
         unknown = next((n for n in parameters if n not in signature.parameters), "")
         near = checks.suggestion(unknown, signature.parameters) if unknown else ""
         said = f"{name}: {error}. {near}".rstrip()
-        raise InputError(f"{said} Its parameters are {signature}; give them with --set.") from error
+        said += f" Its parameters are {signature}; give them with --set, or defaults."
+        raise InputError(said) from error
     return make(**parameters)
 
 
