@@ -4,7 +4,7 @@ alike."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 
 import numpy as np
@@ -72,7 +72,13 @@ class ColonyStatistics:
     omitted: tuple[str, ...] = ()
     # not shown: files of simulations know their statistics by name, and older ones have none
     quantiles: bool = field(default=False, repr=False)
-    amounts: bool = field(default=False, repr=False)
+    amounts: bool = False
+
+    def __repr__(self) -> str:
+        """By which studies and files of simulations are told apart; those of earlier versions knew
+        no amounts."""
+        shown = [f.name for f in fields(self) if f.repr and (f.name != "amounts" or self.amounts)]
+        return f"ColonyStatistics({', '.join(f'{n}={getattr(self, n)!r}' for n in shown)})"
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:

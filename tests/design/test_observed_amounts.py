@@ -183,3 +183,16 @@ def test_what_to_do_with_names_and_times_of_a_cytometer(seen):
         ObservedCourse.from_table(at_times(seen), species=["gfp"], time_unit="h")
     with pytest.raises(tf.InputError, match="amounts"):
         Observed.from_state(seen[1], species=["gfp"], amounts="yes")
+
+
+def test_studies_and_simulations_tell_amounts_from_levels(seen):
+    """Of one table the numbers are the same; the repr of data without amounts is as it ever was."""
+    given = cytometry(seen[1]), {"species": ["gfp"], "columns": {"gfp": "FITC-A"}}
+    plain, of_cells = (Observed.from_table(given[0], **given[1], amounts=x) for x in (False, True))
+    assert plain.values == of_cells.values and repr(plain) != repr(of_cells)
+    assert repr(of_cells.plan) == repr(plain.plan)[:-1] + ", amounts=True)"
+    assert repr(plain.plan) == (
+        "ColonyStatistics(lengths=False, ages=False, positions=False, alignment=False,"
+        " species=('gfp',), edges=(), reach=3.0, length_with_caps=False, relative=False,"
+        " omitted=())"
+    )
