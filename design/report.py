@@ -24,6 +24,7 @@ LARGE = 1e5  # a loss of which decimals say nothing
 LUCKY = 0.8  # of the band on fresh seeds: a search that saw less than this was misled
 SUCCESS = 0.25  # of the loss of the best trivial answer: as in the comparison of methods
 SPREADS = 1.7  # standard errors between a mean and its band of 90 %
+MISSES = "misses constraints"  # in place of a loss that says nothing else
 MANY = 1000.0  # a mean over fewer colonies shows that one of them misses constraints
 # Designs of which not all have the same loss by chance: it differs by less than this share of it.
 # (A solver takes other steps where another species changes.)
@@ -63,15 +64,16 @@ class SearchReport:
 def table(report: SearchReport) -> str:
     """Parameters with bounds, first guess and best value; then losses and measures."""
     first, best, study = report.first, report.best, report.study
+    target = report.task.target
     rows: list[tuple[str, ...]] = [("parameter", "bounds", first.title, best.title, "")]
     rows += parameter_rows(report.task.space, first.values, best.values)
-    rows.append((_loss_title(report), "", show_loss(first.loss), show_loss(best.loss), ""))
+    words = lambda loss: MISSES if misses_constraints(target, loss) else show_loss(loss)
+    rows.append((_loss_title(report), "", words(first.loss), words(best.loss), ""))
     rows += _goals(report)
     if best.fresh is not None:
-        title, loss = f"{_loss_title(report)} on fresh seeds", show_loss(best.fresh.loss)
+        title, loss = f"{_loss_title(report)} on fresh seeds", words(best.fresh.loss)
         rows.append((title, "", "", loss, _seeds(report.task, best.fresh)))
     rows.append(("cells", "", *(cells_in(design.colonies) for design in (first, best)), ""))
-    target = report.task.target
     old, new = (each_measured(target, design.colonies) for design in (first, best))
     seen = {name: f"{value:.4g} ± {by:.2g}" for name, (value, by) in target.evidence.items()}
     if seen:
@@ -151,6 +153,8 @@ def _seeds(task: Task, fresh: FreshLosses) -> str:
     if failed.any() and fresh.loss >= LARGE:  # a mean with failures says nothing of the others
         others = show_loss(float(fresh.losses[~failed].mean())) if not failed.all() else "none"
         return f"{failed.sum()} of {seeds} seeds failed; the mean of the others: {others}"
+    if (missed := misses_constraints(task.target, fresh.losses)).any():
+        return f"on {missed.sum()} of {seeds} seeds"
     low, high = fresh.band
     by = ", which chose it" if fresh.chosen else ""
     return f"{show_loss(low)} … {show_loss(high)}, {seeds} seeds{by}"
@@ -186,7 +190,8 @@ def _warnings(report: SearchReport) -> list[str]:
     elif same := _same_losses(report):
         return [same]
     if answers:
-        each = ", ".join(f"{n} {shown_loss(target, x)}" for n, x in answers.items())
+        shown = lambda x: shown_loss(target, x).removeprefix("loss ")
+        each = ", ".join(f"{n} {shown(x)}" for n, x in answers.items())
         lines = [f"without a pattern: {each}"]
     least = best_trivial(target, answers)
     loss = best.loss if best.fresh is None else best.fresh.loss  # that of the search is luck, too
@@ -276,10 +281,14 @@ def _breaks(bound: str, found: Sequence[float]) -> bool:
     return not all(held[sign](x, float(number)) for sign, number in known for x in found)
 
 
+def misses_constraints(target: Target, loss: np.ndarray | float) -> np.ndarray:
+    """Whether losses are those of designs that miss constraints, in some colonies at least."""
+    return np.logical_and(bool(target.bounds), np.asarray(loss) >= Constrained.BROKEN / MANY)
+
+
 def shown_loss(target: Target, loss: float) -> str:
-    """A loss in words where constraints are missed, in some colonies at least."""
-    missed = target.bounds and loss >= Constrained.BROKEN / MANY
-    return "misses the constraints" if missed else f"{loss:.3f}"
+    """A loss as a report shows it."""
+    return MISSES if misses_constraints(target, loss) else f"loss {loss:.3f}"
 
 
 def trivial_answers(report: SearchReport) -> dict[str, float]:

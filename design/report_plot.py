@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,8 +13,15 @@ import numpy as np
 import torchfilm as tf
 from design.growing import FinishedColonies
 from design.parameters import Parameter, show_value
-from design.report import SearchReport, best_trivial, shown_loss, trivial_answers
+from design.report import (
+    SearchReport,
+    best_trivial,
+    misses_constraints,
+    shown_loss,
+    trivial_answers,
+)
 from design.targets.base import OUTSIDE, Target, known
+from design.targets.goals import Constrained
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,7 +48,8 @@ def draw(report: SearchReport) -> Figure:
     size = tuple(np.max([_extent(cells) for cells in every], axis=0)) if every else (1.0, 1.0)
     height = 6.2 if size[1] > 0.6 * size[0] else 4.6  # wide colonies leave room above
     figure = tf.pictures.new_figure(2.6 * columns + 4.2, height)
-    words = [f"target: {target.describe()}", *([target.mark] if target.mark else [])]
+    about = re.sub(" ([≤≥]) ", "\u00a0\\1\u00a0", target.describe())  # no line ends between the two
+    words = [f"target: {about}", *([target.mark] if target.mark else [])]
     width = 26 * columns + 42
     figure.suptitle("\n".join(textwrap.fill(line, width) for line in words), fontsize=10)
     grid = figure.add_gridspec(
@@ -51,10 +60,10 @@ def draw(report: SearchReport) -> Figure:
     scales: list[Any] = []
     for row, one in enumerate(designs):
         axes = [figure.add_subplot(grid[row, k]) for k in range(columns)]
-        title = f"{one.title}, loss {shown_loss(target, one.loss)}"
-        if one.fresh is not None:
-            again = shown_loss(target, one.fresh.loss)
-            title += f"\n({again} on fresh seeds)"  # no wider than a panel
+        title = f"{one.title}, {shown_loss(target, one.loss)}"
+        if one.fresh is not None:  # no wider than a panel
+            again = shown_loss(target, one.fresh.loss).removeprefix("loss ").split()[0]
+            title += f"\n({again} on fresh seeds)"
         scales = _draw_row(axes, grown[row], frames[row], target, size, limits, title) or scales
     bars = [figure.add_subplot(grid[2, k]) for k in range(columns)]
     units = {n: f.unit for d in report.best.colonies for n, f in d.state.declared.items()}
@@ -199,11 +208,20 @@ def _draw_convergence(ax: Axes, report: SearchReport) -> None:
             failed = np.isin(np.arange(len(entry.loss)), [row for row, _ in entry.reasons])
             losses.append(np.where(failed, np.nan, entry.loss))
     x, y = np.concatenate(places), np.concatenate(losses)
+    first, words = report.first.loss, ("loss", "designs at full size (grey), the best so far (red)")
+    if (missed := misses_constraints(report.task.target, y)).any():
+        if missed.all():
+            y, first = y - Constrained.BROKEN, first - Constrained.BROKEN
+            words = "constraints missed", words[1]
+        else:
+            y = np.where(missed, np.nan, y)
+            first = np.nan if misses_constraints(report.task.target, first) else first
+            words = words[0], f"{words[1]};\nthose that miss constraints are left out"
     ax.plot(x, y, ".", color="0.75", ms=2, zorder=0)
     ax.step(x, np.fmin.accumulate(y), where="post", color="C3")
     if report.first.colonies:
-        ax.plot([0.0], [report.first.loss], "o", color="0.55", clip_on=False)  # as among parameters
-    answers = trivial_answers(report)
+        ax.plot([0.0], [first], "o", color="0.55", clip_on=False)  # as among parameters
+    answers = {} if missed.all() else trivial_answers(report)
     if answers:
         name = best_trivial(report.task.target, answers)
         ax.axhline(answers[name], color="0.3", lw=0.8, ls="--")
@@ -216,8 +234,8 @@ def _draw_convergence(ax: Axes, report: SearchReport) -> None:
     wide = len(some) > 0 and some.min() > 0 and some.max() > WIDE * some.min()
     if wide:
         ax.set_yscale("log")
-    ax.set(xlabel="colonies simulated", ylabel="loss", **({} if wide else {"ylim": (0, None)}))
-    ax.set_title("designs at full size (grey), the best so far (red)", fontsize=9)
+    ax.set(xlabel="colonies simulated", ylabel=words[0], **({} if wide else {"ylim": (0, None)}))
+    ax.set_title(words[1], fontsize=9)
 
 
 def _draw_parameters(ax: Axes, report: SearchReport) -> None:

@@ -93,8 +93,8 @@ def test_constraints_do_not_make_a_burden_a_pattern():
         ).pattern
         == OnFraction("gfp", 0.5, level=1.0).pattern
     )
-    assert shown_loss(target, Constrained.BROKEN + 0.4) == "misses the constraints"
-    assert shown_loss(target, 0.25) == "0.250"
+    assert shown_loss(target, Constrained.BROKEN + 0.4) == "misses constraints"
+    assert shown_loss(target, 0.25) == "loss 0.250"
 
 
 def luck(here, fresh, reduce="mean") -> str:
@@ -126,3 +126,26 @@ def test_the_worst_of_two_is_less_than_the_worst_of_ten_without_luck():
         losses = rng.lognormal(0.0, 0.4, 12)
         said += bool(luck(losses[:2].tolist(), losses[2:].tolist(), reduce="worst"))
     assert said < 45  # 33 % of them, before
+
+
+def test_missed_constraints_are_words_in_tables_and_pictures(tmp_path):
+    """They were losses of 1000000000.284."""
+    impossible = Constrained(
+        OnFraction("gfp", 0.5, level=1.0), [Burden()], at_most={"burden": 1e-9}
+    )
+    best = searched(impossible)
+    said = best.table()
+    (row,) = [line for line in said.splitlines() if line.startswith("loss   ")]
+    assert row.split()[1:] == ["misses", "constraints"] * 2
+    (row,) = [line for line in said.splitlines() if line.startswith("loss on fresh")]
+    assert "misses constraints" in row and "seeds" in row and "e+09" not in said
+    figure = best.plot(tmp_path / "missed.png")
+    words = [ax.get_title() for ax in figure.figure.axes] + [
+        ax.get_ylabel() for ax in figure.figure.axes
+    ]
+    assert any(w.startswith("best, misses constraints\n(misses on fresh seeds)") for w in words)
+    assert "constraints missed" in words
+
+    some = Constrained(OnFraction("gfp", 0.5, level=1.0), [Burden()], at_most={"burden": 1.0})
+    titles = [ax.get_title() for ax in searched(some).plot(tmp_path / "some.png").figure.axes]
+    assert any("those that miss constraints are left out" in w for w in titles)
