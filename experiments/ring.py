@@ -96,4 +96,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except tf.InputError as error:
+        raise SystemExit(str(error)) from None
