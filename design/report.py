@@ -16,6 +16,7 @@ from design.parameters import Choice, Parameter, Space, Value, show_value
 from design.study import Study
 from design.targets.base import Target
 from design.targets.goals import Constrained, Goals
+from design.targets.lasting import Lasting
 from design.task import Task
 from design.trivial import EVERY_SECOND, trivial_losses
 
@@ -293,9 +294,13 @@ def shown_loss(target: Target, loss: float) -> str:
 
 def trivial_answers(report: SearchReport) -> dict[str, float]:
     """The losses of trivial answers in the colonies of the best design. A sum of goals compares
-    nothing; data, and a target without species, have none."""
+    nothing; data, and a target without species, have none. Of targets with constraints the goal
+    counts: losses of the others do not."""
     target, colonies = report.task.target, report.best.colonies
-    compared = target.names and target.pattern and not report.task.goals and colonies
+    goal = target
+    while isinstance(goal, (Constrained, Lasting)):
+        goal = goal.target
+    compared = goal.names and goal.pattern and not report.task.goals and colonies
     return trivial_losses(target, colonies, report.task.reduced) if compared else {}
 
 

@@ -189,11 +189,6 @@ class Constrained(Several):
     def failed(self) -> float:  # type: ignore[override]
         return max(self.BROKEN + 1.0, self.target.failed)
 
-    @property
-    def pattern(self) -> bool:  # type: ignore[override]
-        # others bound it, and their losses do not count
-        return self.target.pattern and bool(self.target.names)
-
     def check(self, state: tf.State) -> None:
         super().check(state)
         each = self._measured(state)
