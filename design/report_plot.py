@@ -209,8 +209,10 @@ def _draw_convergence(ax: Axes, report: SearchReport) -> None:
             losses.append(np.where(failed, np.nan, entry.loss))
     x, y = np.concatenate(places), np.concatenate(losses)
     first, words = report.first.loss, ("loss", "designs at full size (grey), the best so far (red)")
-    if (missed := misses_constraints(report.task.target, y)).any():
-        if missed.all():
+    missed = misses_constraints(report.task.target, y)
+    none = missed.any() and missed[~np.isnan(y)].all()  # of those that did not fail meets them
+    if missed.any():
+        if none:
             y, first = y - Constrained.BROKEN, first - Constrained.BROKEN
             words = "constraints missed", words[1]
         else:
@@ -221,7 +223,7 @@ def _draw_convergence(ax: Axes, report: SearchReport) -> None:
     ax.step(x, np.fmin.accumulate(y), where="post", color="C3")
     if report.first.colonies:
         ax.plot([0.0], [first], "o", color="0.55", clip_on=False)  # as among parameters
-    answers = {} if missed.all() else trivial_answers(report)
+    answers = {} if none else trivial_answers(report)
     if answers:
         name = best_trivial(report.task.target, answers)
         ax.axhline(answers[name], color="0.3", lw=0.8, ls="--")
