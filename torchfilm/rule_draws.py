@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.circuits.draws import poisson
+from torchfilm.circuits.molecules import nearest
 from torchfilm.circuits.partition import binomial
 from torchfilm.rule_values import RuleError, as_tensor
 from torchfilm.state import State
@@ -69,8 +70,8 @@ class Draws:
         k = parent.binomial(parent.plasmids, 0.5)."""
         drawn = self.random()
         given = _column("binomial", number, drawn)
-        count = given.round()  # of molecules: a concentration times a volume, but for rounding
-        off = (given - count).abs() > 8 * torch.finfo(self._state.dtype).eps * count.clamp(min=1.0)
+        # of molecules: a concentration times a volume
+        count, off = nearest(given, self._state.dtype)
         wrong = given[~((count >= 0) & ~off & count.isfinite())]
         if wrong.numel():
             raise RuleError(

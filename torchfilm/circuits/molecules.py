@@ -12,15 +12,21 @@ from torch import Tensor
 ROUNDED = 8
 
 
+def nearest(amount: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """The nearest whole numbers, and which amounts are none, not even but for the rounding of
+    `dtype`."""
+    near = torch.round(amount)
+    eps = torch.finfo(dtype).eps
+    return near, (amount - near).abs() > ROUNDED * eps * amount.abs().clamp(min=1.0)
+
+
 def whole(
     amount: Tensor, uniform: Callable[[], Tensor], dtype: torch.dtype | None = None
 ) -> Tensor:
     """Whole numbers of molecules: the nearest where an amount is one but for the rounding of
     `dtype`, by default its own; else rounded up or down at random, so that the mean stays.
     uniform: draws, of the shape of the amounts."""
-    near = torch.round(amount)
-    eps = torch.finfo(dtype or amount.dtype).eps
-    off = (amount - near).abs() > ROUNDED * eps * amount.abs().clamp(min=1.0)
+    near, off = nearest(amount, dtype or amount.dtype)
     if off.device.type == "cpu" and not bool(off.any()):
         return near
     return torch.where(off, torch.floor(amount + uniform().to(amount.dtype)), near)
