@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -291,6 +291,14 @@ def species_name(name: str, given: object) -> None:
         raise checks.input_error(
             name, given, 'the name of a species, such as "yfp", or of a signal, such as "out.ahl"'
         )
+
+
+def requiring_gradients(state: tf.State, names: Iterable[str]) -> tf.State:
+    """A copy of a state whose fields of these names require a gradient, if they are numbers with
+    one."""
+    there = ((n, state.fields[n]) for n in names if n in state.fields)
+    moved = {n: x.detach().clone().requires_grad_() for n, x in there if x.is_floating_point()}
+    return state.with_fields(**moved)
 
 
 def species_names(name: str, given: object, count: int | None = None) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from design.targets.base import (
     of_one_condition,
     ratio,
     require,
+    requiring_gradients,
     species_names,
     total,
     valid_levels,
@@ -208,10 +209,8 @@ class Constrained(Several):
                 )
 
     def why_rough(self, state: tf.State) -> str:
-        read = {n: x for n, x in state.fields.items() if n in self.names and x.is_floating_point()}
         with torch.enable_grad():
-            moved = {n: x.detach().clone().requires_grad_() for n, x in read.items()}
-            each = self._measured(state.with_fields(**moved))
+            each = self._measured(requiring_gradients(state, self.names))
         found = {name: x for measures in each for name, x in measures.items()}
         lacking = [name for name in self.bounds if not found[name].requires_grad]
         why = f"constraints on {' and '.join(lacking)} have no derivatives"

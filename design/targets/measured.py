@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import WORST, Target, ended_elsewhere
+from design.targets.base import WORST, Target, ended_elsewhere, requiring_gradients
 from torchfilm import checks
 
 Measure = Callable[[tf.State], Tensor]
@@ -99,11 +99,7 @@ class Measured(Target):
         if not self.smooth:
             return "measures of your own may pass no gradient (smooth=True)"
         with torch.enable_grad():
-            each = {
-                n: x.detach().clone().requires_grad_()
-                for n, x in state.fields.items() if x.is_floating_point()
-            }  # fmt: skip
-            moved = state.with_fields(**each)
+            moved = requiring_gradients(state, state.fields)
             lacking = [n for n, x in self.functions.items() if not _has_gradient(x, moved)]
         names = " and ".join(map(repr, lacking))
         return f"no gradient passes through {names} of Measured" if lacking else ""
