@@ -380,9 +380,8 @@ class BoundEffect:
         """The state after this effect has acted for dt hours."""
         if not is_own(self.effect):
             return self.effect.step(state, dt, self.values)
-        before = own_step.seen(state)
-        made = self.effect.step(state, dt, self.values)
-        return own_step.check_step(type(self.effect).__name__, before, made, self.writes())
+        step = functools.partial(self.effect.step, state, dt, self.values)
+        return own_step.taken(type(self.effect).__name__, step, state, self.writes())
 
     def run_step(self, state: State, dt: float, timings: Timings | None = None) -> State:
         """As `step`, with torch's `threads`, and timed."""

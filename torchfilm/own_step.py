@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 from torch import Tensor
 
 from torchfilm.state import PER_CELL, PER_COLONY, State
 from torchfilm.tools import checks
+from torchfilm.tools.deterministic_math import deterministic_functions
 from torchfilm.tools.hot_reload import unchanged
 
 COLUMNS = (*PER_CELL, *PER_COLONY)
+
+
+def taken(
+    name: str, step: Callable[[], object], state: State, writes: Collection[str]
+) -> State:  # fmt: skip
+    """The state that an effect of this name makes of a state by `step()`. The bits of a colony do
+    not depend on the colonies beside it. Raises as `check_step`."""
+    before = seen(state)
+    with deterministic_functions():
+        made = step()
+    return check_step(name, before, made, writes)
 
 
 def seen(state: State) -> dict[str, tuple[Tensor, int]]:

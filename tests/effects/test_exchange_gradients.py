@@ -109,3 +109,34 @@ def test_a_graph_that_is_kept_gives_the_gradient_again():
         float(torch.autograd.grad(end, making, retain_graph=keep)[0]) for keep in (True, False)
     )
     assert first == second
+
+
+def test_a_network_reads_what_a_compiled_circuit_takes():
+    """Kernels take the first pass of transport, and torch those with gradients."""
+    net = torch.nn.Linear(1, 1).double()
+    with torch.no_grad():
+        net.weight.fill_(0.5)
+        net.bias.fill_(0.1)
+
+    def eats(u, s, p, cell):
+        return {"g": s.food}, {"food": -s.food * cell.volume}
+
+    def reads(u, s, p, cell):
+        return {"n": torch.nn.functional.softplus(net(s.food[:, None]))[:, 0] - u.n}
+
+    medium = tf.Medium(
+        food=tf.Signal(diffusion=100.0, initial=1.0), box=((-16, -16), (16, 16)), spacing=4.0,
+        depth=1.0,
+    )  # fmt: skip
+    given = tf.Scene(
+        tf.Growth(rate=1.0), tf.Circuit(eats, species="g"),
+        tf.Circuit(reads, species="n", name="net"), medium, dim=2, dt=0.05,
+    )  # fmt: skip
+    loss = lambda: [*tf.simulate(given, given.bind(dtype=F64).start(), until=0.2)][-1].n.sum()
+    found = torch.autograd.grad(loss(), net.weight)[0]
+    ends = []
+    for change in (1e-5, -1e-5):
+        with torch.no_grad():
+            net.weight.fill_(0.5 + change)
+            ends.append(float(loss()))
+    assert float(found) == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4)

@@ -43,6 +43,17 @@ WRITTEN = {
     "softplus": torch.nn.functional.softplus,
     "silu": torch.nn.functional.silu,
     "elu": lambda x: torch.nn.functional.elu(x - 2),
+    "selu": lambda x: torch.nn.functional.selu(x - 2),
+    "torch.celu": lambda x: torch.celu(x - 2, 0.7),
+    "mish": torch.nn.functional.mish,
+    "gelu": torch.nn.functional.gelu,
+    "gelu by tanh": lambda x: torch.nn.functional.gelu(x, approximate="tanh"),
+    "logit": lambda x: torch.logit(x / 7, eps=1e-3),
+    "sigmoid in place": lambda x: x.clone().sigmoid_(),
+    "atan2": lambda x: torch.atan2(x - 2, 1 - x),
+    "sum of columns": lambda x: layer(x)[0].sum(1),
+    "sum of rows": lambda x: torch.stack([x, 2 - x, x * x, x - 3, 1 / (1 + x)]).sum(dim=0),
+    "mean of columns": lambda x: torch.mean(layer(x)[0], -1, True)[:, 0],
     "rsqrt": torch.rsqrt,
     "logaddexp": lambda x: torch.logaddexp(x, 2 - x),
     "hypot": lambda x: torch.hypot(x, 2 - x),
@@ -226,6 +237,9 @@ OTHERS = {
     deterministic_math.softplus: torch.nn.functional.softplus,
     deterministic_math.silu: torch.nn.functional.silu,
     deterministic_math.elu: torch.nn.functional.elu,
+    deterministic_math.selu: torch.nn.functional.selu,
+    deterministic_math.celu: torch.nn.functional.celu,
+    deterministic_math.mish: torch.nn.functional.mish,
     deterministic_math.sinh: torch.sinh,
     deterministic_math.cosh: torch.cosh,
 }
@@ -257,12 +271,61 @@ def test_two_arguments_are_torchs(dtype):
     )
 
 
+@pytest.mark.parametrize("approximate", ["none", "tanh"])
+def test_gelu_is_torchs(dtype, approximate):
+    """Where 1 + erf is nearly 0 it keeps few digits of a number that is then next to nothing."""
+    x = torch.linspace(-9, 9, 2001, dtype=dtype)
+    found = deterministic_math.gelu(x, approximate)
+    expected = torch.nn.functional.gelu(x.double(), approximate=approximate)
+    eps = torch.finfo(dtype).eps
+    assert torch.allclose(found.double(), expected, rtol=16 * eps, atol=8 * eps)
+
+
+def test_angles_are_torchs(dtype):
+    """In every quadrant, on the axes, and for zeros of both signs."""
+    at = torch.tensor([-2.0, -1.0, -0.0, 0.0, 1e-3, 1.0, 3.0, math.inf, -math.inf], dtype=dtype)
+    y, x = (part.reshape(-1) for part in torch.meshgrid(at, at, indexing="ij"))
+    both_infinite = torch.isinf(x) & torch.isinf(y)
+    found, expected = deterministic_math.atan2(y, x), torch.atan2(y, x)
+    assert torch.allclose(
+        found[~both_infinite], expected[~both_infinite], rtol=4 * torch.finfo(dtype).eps
+    )
+    inputs = [t.double().requires_grad_() for t in (torch.tensor([2.0, -1.0]), x.new([0.5, -3.0]))]
+    assert torch.autograd.gradcheck(deterministic_math.atan2, inputs)
+
+
+def test_logits_are_torchs(dtype):
+    x = torch.tensor([0.0, 1e-3, 0.3, 0.5, 1.0], dtype=dtype)
+    eps = torch.finfo(dtype).eps
+    for least in (None, 0.01):
+        found, expected = deterministic_math.logit(x, least), torch.logit(x, least)
+        assert torch.allclose(found, expected, rtol=8 * eps, atol=eps)
+
+
+def test_sums_over_an_axis_are_torchs(dtype):
+    x = torch.rand(7, 6, 5, dtype=dtype)
+    with deterministic_functions():
+        for axis in (0, 1, -1):
+            for keep in (False, True):
+                assert torch.allclose(
+                    x.sum(axis, keep), torch.sum(x.double(), axis, keep).to(dtype)
+                )
+                assert torch.allclose(
+                    torch.mean(x, axis, keep), x.double().mean(axis, keep).to(dtype)
+                )
+        assert float(x.sum()) > 0 and x.sum((0, 1)).shape == (5,)  # left to torch
+        assert torch.sum(x, dim=1, dtype=torch.float64).dtype == torch.float64
+        assert torch.ones(3, 4, dtype=torch.bool).sum(1).tolist() == [4, 4, 4]
+        assert torch.zeros(0, 6, dtype=dtype).sum(1).shape == (0,)
+
+
 def test_arguments_may_be_named_as_in_torch():
     x, y = torch.tensor([0.5, 2.0]), torch.tensor([1.0, 3.0])
     with deterministic_functions():
         for function in (torch.rsqrt, torch.sigmoid, torch.exp2, torch.nn.functional.softplus):
             assert torch.equal(function(input=x), function(x))
-        for function in (torch.logaddexp, torch.hypot):
+        assert torch.equal(torch.sum(input=x.expand(3, 2), dim=0), 3 * x)
+        for function in (torch.logaddexp, torch.hypot, torch.atan2):
             assert torch.equal(function(x, other=y), function(x, y))
 
 

@@ -26,6 +26,8 @@ from torchfilm.rule_values import RuleError, warn_of_mixing
 from torchfilm.rule_views import KNOWN_FIELDS, CellsView, Constants, DivisionView
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
+from torchfilm.tools.deterministic_math import deterministic_functions
+from torchfilm.tools.hashing import module_of
 from torchfilm.tools.hot_reload import HotReload
 from torchfilm.tools.warn_once import warn
 
@@ -347,11 +349,9 @@ def _variable(name: str, value: Tensor) -> Field:
 
 
 def label_of(rule: Callable[..., object]) -> str:
-    """A label that gives each rule its own random numbers."""
-    return (
-        f"rule {getattr(rule, '__module__', '')}"
-        f" {getattr(rule, '__qualname__', type(rule).__name__)}"
-    )
+    """A label that gives each rule its own random numbers: the same in a script, where the script
+    is imported, and in the processes that it starts."""
+    return f"rule {module_of(rule)} {getattr(rule, '__qualname__', type(rule).__name__)}"
 
 
 @contextmanager
@@ -373,7 +373,8 @@ def act(rule: Callable[..., object], *views: CellsView | DivisionView) -> None:
     number, or calls a function with what that does not take, or if it returns values by name, which
     would be lost. Errors of other kinds are raised as they are."""
     try:
-        returned = rule(*views)
+        with deterministic_functions():
+            returned = rule(*views)
     except (RuntimeError, ValueError, TypeError) as error:
         hint = next((words for part, words in HINTS.items() if part in str(error)), "")
         own = isinstance(error, checks.InputError) or not isinstance(error, (ValueError, TypeError))

@@ -121,8 +121,8 @@ def move(
     )  # fmt: skip
     with subnormals.as_zero():
         for k, (one, batch) in enumerate(zip(joint.operators, joint.grid.batches, strict=True)):
-            if far[k] is None:
-                far[k] = np.zeros(batch.starts.numel(), bool)
+            # a tensor where torch took the last pass
+            far[k] = np.zeros(batch.starts.numel(), bool) if far[k] is None else np.asarray(far[k])
             given = *_grids(joint, one, batch), *numbers, far[k], joint.turned.numpy()
             one.shared(batch.starts.numel(), partial(_run, run, given))
     return end, at_end, average, taken

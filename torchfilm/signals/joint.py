@@ -76,7 +76,8 @@ class JointTransport:
     @cached_property
     def _far(self) -> list[Any]:
         """Of each of `grid.batches`, (b,), the colonies that needed backward Euler: they keep to
-        it, or the two would alternate."""
+        it, or the two would alternate. An array where kernels took the last pass, else a tensor."""
+
         return [None] * len(self.carried)
 
     @cached_property
@@ -111,7 +112,7 @@ class JointTransport:
         losses = self._spread(rate)
         ends, means, found = [], [], []
         for k, (one, batch) in enumerate(zip(self.carried, self.grid.batches, strict=True)):
-            before = self._far[k]
+            before = None if self._far[k] is None else torch.as_tensor(self._far[k])
             end, average, self._far[k] = one.step(
                 batch.of(self.field), batch.of(losses), self.dt, before, batch.of(given)
             )

@@ -6,9 +6,10 @@ value depends on its place and on the tensor's size.
 
 Functions found to differ, on torch 2.13 (AVX-512, both precisions): pow with any exponent other
 than the plain numbers 0, 1, 2, 3, ±½, −1, −2 (also a tensor with value 2), a number to the power of
-a tensor, exp2, sinh, cosh, atanh, sigmoid, softplus, silu, elu, gelu, mish, logit (strided),
-logaddexp, hypot, atan2, gammainc. rsqrt is that of one library, whose last bit depends on the
-processor; compiled circuits have 1/√x, and so has torch here.
+a tensor, exp2, sinh, cosh, atanh, sigmoid, softplus, silu, elu, selu, celu, gelu, mish, logit
+(strided), logaddexp, hypot, atan2, gammainc, and sums of more than four columns. rsqrt is that of
+one library, whose last bit depends on the processor; compiled circuits have 1/√x, and so has torch
+here.
 
 Functions found deterministic, with their derivatives: exp, expm1, log, log2, log10, log1p, sqrt,
 sin, cos, tan, asin, acos, atan, tanh, asinh, acosh, erf, erfc, erfinv, lgamma, gammaincc,
@@ -27,6 +28,8 @@ from torch.overrides import TorchFunctionMode
 
 # Larger integer exponents use exp and log, whose error is then smaller.
 MAX_SQUARED = 64
+# More numbers than so many along an axis are thought to be cells, and left to torch.
+MOST_COLUMNS = 64
 # |x| at or below this counts as 0 where a logarithm is taken: the second derivative, ~ 1/x², must
 # not overflow the dtype.
 FLOOR = {torch.float32: 1e-18, torch.float64: 1e-150}
@@ -132,6 +135,47 @@ def elu(x: Tensor, alpha: float = 1.0, inplace: bool = False) -> Tensor:
     return torch.where(x > 0, x, alpha * torch.expm1(torch.where(x > 0, 0.0, x)))
 
 
+def selu(x: Tensor, inplace: bool = False) -> Tensor:
+    """β x above 0, β α (eˣ − 1) below, with torch's α and β."""
+    return 1.0507009873554804934193349852946 * elu(x, 1.6732632423543772848170429916717)
+
+
+def celu(x: Tensor, alpha: float = 1.0, inplace: bool = False) -> Tensor:
+    """x above 0, α (e^{x/α} − 1) below."""
+    return torch.where(x > 0, x, alpha * torch.expm1(torch.where(x > 0, 0.0, x) / alpha))
+
+
+def mish(x: Tensor, inplace: bool = False) -> Tensor:
+    """x tanh(log(1 + eˣ))."""
+    return x * torch.tanh(softplus(x))
+
+
+def gelu(x: Tensor, approximate: str = "none") -> Tensor:
+    """x times the share of a normal law below x; "tanh" has torch's approximation of it."""
+    if approximate == "tanh":
+        inner = math.sqrt(2 / math.pi) * (x + 0.044715 * x * x * x)
+        return 0.5 * x * (1 + torch.tanh(inner))
+    return 0.5 * x * (1 + torch.erf(x * math.sqrt(0.5)))
+
+
+def logit(x: Tensor, eps: float | None = None) -> Tensor:
+    """log(x/(1 − x)), of x between eps and 1 − eps if that is given."""
+    x = x if eps is None else x.clamp(eps, 1 - eps)
+    return torch.log(x / (1 - x))
+
+
+def atan2(y: Tensor, other: Tensor) -> Tensor:
+    """The angle of (x, y), from −π to π; x: `other`, as torch calls it."""
+    x = other
+    steep = y.abs() > x.abs()
+    over, under = torch.where(steep, x, y), torch.where(steep, y, x)
+    none = under == 0  # both are
+    angle = torch.atan(over / torch.where(none, 1.0, under))
+    half = torch.copysign(torch.full_like(angle, math.pi / 2), y)
+    back = torch.where(torch.signbit(x), 2 * half, 0.0)
+    return torch.where(steep, half - angle, torch.where(none, back, angle + back))
+
+
 def sinh(x: Tensor) -> Tensor:
     """(eˣ − e⁻ˣ)/2."""
     return 0.5 * (torch.expm1(x) - torch.expm1(-x))
@@ -212,7 +256,23 @@ def _ipow(x: Tensor, n: float | Tensor) -> Tensor | None:
     return None if out is None else x.copy_(out)
 
 
-def _floating(function: Callable[..., Tensor]) -> Callable[..., Tensor | None]:
+def _sum(x: Tensor, dim: Any = None, keepdim: Any = False, **other: Any) -> Tensor | None:
+    """The sum over one axis of a few numbers, in their order."""
+    one_axis = type(dim) is int and type(keepdim) is bool and not other
+    if not one_axis or x.dim() < 2 or not 1 < x.shape[dim] <= MOST_COLUMNS:
+        return None
+    first, *others = x.unbind(dim)
+    for column in others:
+        first = first + column
+    return first.unsqueeze(dim) if keepdim else first
+
+
+def _mean(x: Tensor, dim: Any = None, keepdim: Any = False, **other: Any) -> Tensor | None:
+    found = _sum(x, dim, keepdim, **other)
+    return None if found is None else found / x.shape[dim]
+
+
+def _floating(function: Callable[..., Tensor | None]) -> Callable[..., Tensor | None]:
     def replaced(input: Tensor, *args: Any, **kwargs: Any) -> Tensor | None:
         fits = isinstance(input, Tensor) and input.is_floating_point()
         return function(input, *args, **kwargs) if fits else None
@@ -238,6 +298,17 @@ REPLACEMENTS: dict[Callable[..., Any], Callable[..., Tensor | None]] = {
     **dict.fromkeys((torch.logaddexp, Tensor.logaddexp), _floating(logaddexp)),
     **dict.fromkeys((torch.hypot, Tensor.hypot), _floating(hypot)),
     **dict.fromkeys((torch.rsqrt, Tensor.rsqrt), _floating(rsqrt)),
+    **dict.fromkeys((torch.atan2, Tensor.atan2, torch.arctan2, Tensor.arctan2), _floating(atan2)),
+    **dict.fromkeys((torch.logit, Tensor.logit, torch.special.logit), _floating(logit)),
+    **dict.fromkeys((torch.sum, Tensor.sum), _floating(_sum)),
+    **dict.fromkeys((torch.mean, Tensor.mean), _floating(_mean)),
+    Tensor.sigmoid_: lambda x: x.copy_(sigmoid(x)),
+    torch.nn.functional.selu: _floating(selu),
+    torch.nn.functional.celu: _floating(celu),
+    torch.nn.functional.mish: _floating(mish),
+    torch.nn.functional.gelu: _floating(gelu),
+    torch.selu: _floating(selu),
+    torch.celu: _floating(celu),
     torch.nn.functional.softplus: _floating(softplus),
     torch.nn.functional.silu: _floating(silu),
     torch.nn.functional.elu: _floating(elu),
@@ -259,10 +330,10 @@ class _DeterministicMode(TorchFunctionMode):
 def deterministic_functions() -> TorchFunctionMode:
     """Within `with deterministic_functions():` this module's functions replace torch's.
 
-    It covers pow and **, rsqrt, sigmoid, exp2, sinh, cosh, atanh, softplus, silu, elu, logaddexp,
-    hypot, linear layers and products with a matrix (K, M), in the forward and reverse modes of
-    autograd.
-    It does not cover gelu, mish, logit, atan2, gammainc and products with batches of matrices.
+    It covers pow and **, rsqrt, sigmoid, exp2, sinh, cosh, atanh, softplus, silu, elu, selu, celu,
+    mish, gelu, logit, logaddexp, hypot, atan2, linear layers, products with a matrix (K, M), and
+    sums and means over an axis of up to MOST_COLUMNS, in the forward and reverse modes of autograd.
+    It does not cover gammainc, products with batches of matrices, and other forms in place.
     The cost is about a microsecond per torch call.
     """
     return _DeterministicMode()

@@ -68,6 +68,8 @@ def _add(hasher: Any, thing: Any, enclosing: set[int], met: dict[int, int]) -> N
     hasher.update(b")")
 
 
+# The names of the script that runs, in its own process and in those that it starts.
+SCRIPT = ("__main__", "__mp_main__")
 OURS = ("torchfilm", "design", "torch", "numpy", "builtins")
 
 
@@ -125,10 +127,30 @@ def _parts(thing: Any) -> list[Any]:
 
 def _imported(text: str) -> str:
     """A repr in which a class of the script that runs is named as where the script is imported."""
-    main = getattr(sys.modules.get("__main__"), "__file__", None)
-    return (
-        text if main is None else text.replace("<class '__main__.", f"<class '{Path(main).stem}.")
-    )
+    for name in SCRIPT:
+        text = text.replace(f"<class '{name}.", f"<class '{_script(name)}.")
+    return text
+
+
+def module_of(thing: object) -> str:
+    """The name of the module that defines a function or an object's class: for the script that
+    runs, that by which others import it, also in the processes that it starts."""
+    name = getattr(thing, "__module__", None) or ""
+    return _script(name, thing) if name in SCRIPT else name
+
+
+def _script(name: str, thing: object = None) -> str:
+    """The name by which the script that runs is imported; `name` where there is no file of it.
+    thing: defined there; another process may have sent it."""
+    main = sys.modules.get("__main__")
+    code = getattr(thing, "__code__", None)
+    if code is None:  # an object that is called
+        code = getattr(vars(type(thing)).get("__call__"), "__code__", None)
+    file = getattr(main, "__file__", None) if code is None else code.co_filename
+    spec = getattr(main, "__spec__", None)
+    if spec is not None and file == spec.origin:  # by `python -m`
+        return str(spec.name)
+    return Path(file).stem if file and Path(file).suffix == ".py" else name
 
 
 def _is_plain_object(thing: Any) -> bool:
