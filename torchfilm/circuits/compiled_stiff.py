@@ -1,16 +1,18 @@
 """Circuits by the stiff method as compiled functions: the numbers of `circuits.rosenbrock`, cell by
-cell without torch, and in forward mode their tangents."""
+cell without torch, and their derivatives, of both kinds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.circuits import compiled_gradients
 from torchfilm.circuits.compiled import Compiled, packed, pools, rates_of, values_text
 from torchfilm.circuits.emission import functions, tangent_functions
 from torchfilm.circuits.expressions import Expression
@@ -29,7 +31,7 @@ class CompiledStiff(Compiled):
     """The stiff method."""
 
     slopes: Mapping[tuple[int, int], Expression]
-    # by the columns and numbers that carry tangents
+    # by what has a number for each cell, and by the columns and numbers that carry tangents
     _moved: dict[Any, CompiledTangents] = field(default_factory=dict, repr=False)
 
     @property
@@ -55,22 +57,37 @@ class CompiledStiff(Compiled):
     def integrate(
         self, circuit: CircuitCells, start: Tensor, dt: float, rtol: float, atol: float
     ) -> tuple[Tensor, RosenbrockReport] | None:  # fmt: skip
-        """As `rosenbrock.rodas3`, of the cells `circuit.rows`, with tangents in forward mode; None
-        where a backward pass is wanted, and over no time."""
+        """As `rosenbrock.rodas3`, of the cells `circuit.rows`, with derivatives; None over no time,
+        where both kinds are wanted at once, and for gradients by too many numbers."""
         if dt == 0:
             return None
         values = self.values(circuit, circuit.rows, pools(circuit, circuit.rows))
         if not tracked(start, *values.values()):
             return self._rodas3(values, start, dt, rtol, atol)
-        if not only_forward(start, *values.values()):
+        if only_forward(start, *values.values()):
+            moving = {n for n, x in values.items() if has_tangent(x)}
+            some = lambda names: tuple(n for n in names if n in moving)
+            made = self._tangents(self.columns, some(self.columns), some(self.numbers))
+            return made.rodas3(values, start, dt, rtol, atol)
+        wanted = compiled_gradients.moving(self.columns, values)
+        directions = len(self.equations.variables) + len(wanted)
+        if has_tangent(start, *values.values()) or directions > compiled_gradients.MOST_DIRECTIONS:
             return None
-        moving = {n for n, x in values.items() if has_tangent(x)}
-        key = tuple(tuple(n for n in x if n in moving) for x in (self.columns, self.numbers))
+        columns = tuple(dict.fromkeys((*self.columns, *wanted)))
+        made = self._tangents(columns, wanted, ())
+        return compiled_gradients.rodas3(made, values, start, (dt, rtol, atol))
+
+    def _tangents(
+        self, columns: Sequence[str], moving: Sequence[str], moving_numbers: Sequence[str]
+    ) -> CompiledTangents:
+        """The method with tangents of these, where these names have a number for each cell."""
+        key = tuple(columns), tuple(moving), tuple(moving_numbers)
         if key not in self._moved:
+            numbers = tuple(n for n in self.numbers if n not in columns)
             self._moved[key] = CompiledTangents(
-                self.equations, self.literals, self.columns, self.numbers, *key, label=self.label
+                self.equations, self.literals, key[0], numbers, *key[1:], label=self.label
             )
-        return self._moved[key].rodas3(values, start, dt, rtol, atol)
+        return self._moved[key]
 
     def _rodas3(
         self, values: Mapping[str, Tensor], start: Tensor, dt: float, rtol: float, atol: float
@@ -120,15 +137,25 @@ class CompiledTangents(Compiled):
                 turns[name] = turn
         columns, numbers = self.packed(still, count)
         report = torch.zeros(3, count, dtype=torch.int64)
-        arrays = (
-            at.numpy(), moved.numpy(), columns, packed(turns, self.moving, count), numbers,
-            packed(turns, self.moving_numbers),
-        )  # fmt: skip
-        rest, counts = limits(dt, rtol, atol, dtype), report.numpy()
-        run = self.module.run_moved
-        work = lambda first, last: run(first, last, *arrays, *rest, *counts)
-        self.run(count, work)
+        of_cells = at, moved, columns, packed(turns, self.moving, count)
+        of_all = numbers, packed(turns, self.moving_numbers)
+        self.run_steps(of_cells, of_all, (dt, rtol, atol), dtype, report)
         return with_tangent(at.to(dtype), moved.to(dtype)), RosenbrockReport(*report)
+
+    def run_steps(
+        self, of_cells: tuple[Tensor, Tensor, np.ndarray, np.ndarray],
+        of_all: tuple[np.ndarray, np.ndarray], settings: tuple[float, float, float],
+        dtype: torch.dtype, report: Tensor,
+    ) -> None:  # fmt: skip
+        """The steps of M cells, in place. of_cells: variables and their tangents (M, V), columns
+        (K, M) and theirs (Q, M). of_all: numbers (L,) and their tangents. settings: dt, rtol, atol.
+        report: (3, M)."""
+        at, moved, columns, turning = of_cells
+        numbers, turned = of_all
+        arrays = at.numpy(), moved.numpy(), columns, turning, numbers, turned
+        rest = *limits(*settings, dtype), *report.numpy()
+        run = self.module.run_moved
+        self.run(len(at), lambda first, last: run(first, last, *arrays, *rest))
 
 
 @lru_cache(64)
