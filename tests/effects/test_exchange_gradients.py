@@ -132,7 +132,7 @@ def test_a_network_reads_what_a_compiled_circuit_takes():
         tf.Growth(rate=1.0), tf.Circuit(eats, species="g"),
         tf.Circuit(reads, species="n", name="net"), medium, dim=2, dt=0.05,
     )  # fmt: skip
-    loss = lambda: [*tf.simulate(given, given.bind(dtype=F64).start(), until=0.2)][-1].n.sum()
+    loss = lambda: [*tf.simulate(given, given.bind(dtype=F64).start(), until=0.2)][-1].net_n.sum()
     found = torch.autograd.grad(loss(), net.weight)[0]
     ends = []
     for change in (1e-5, -1e-5):

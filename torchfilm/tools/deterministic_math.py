@@ -224,6 +224,8 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 
 def _linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor | None:
     fits = x.dim() > 0 and weight.dim() == 2 and x.shape[-1] == weight.shape[1]
+    if isinstance(x, Tensor) and x.layout is not torch.strided:  # rows of sparse matrices add alone
+        return None
     return linear(x, weight, bias) if fits and x.is_floating_point() else None
 
 
@@ -259,7 +261,12 @@ def _ipow(x: Tensor, n: float | Tensor) -> Tensor | None:
 def _sum(x: Tensor, dim: Any = None, keepdim: Any = False, **other: Any) -> Tensor | None:
     """The sum over one axis of a few numbers, in their order."""
     one_axis = type(dim) is int and type(keepdim) is bool and not other
-    if not one_axis or x.dim() < 2 or not 1 < x.shape[dim] <= MOST_COLUMNS:
+    if (
+        not one_axis
+        or x.layout is not torch.strided
+        or x.dim() < 2
+        or not 1 < x.shape[dim] <= MOST_COLUMNS
+    ):
         return None
     first, *others = x.unbind(dim)
     for column in others:
