@@ -187,8 +187,10 @@ def test_networkx(whole):
     one = tree.to_networkx(colony=0)
     assert set(networkx.descendants(one, (0, 1))) == {(0, c) for c in tree.descendants(1, colony=0)}
     row = keys_of(tree).index((0, 0))
-    known = {"colony": 0, "cell": 0}
-    assert one.nodes[0, 0] == known | {"born": 0.0, "ended": tree.ended[row], "fate": "divided"}
+    about = one.nodes[0, 0]
+    known = {"colony": 0, "cell": 0, "born": 0.0, "ended": tree.ended[row], "fate": "divided"}
+    assert about.items() >= known.items() and list(about) == list(tree.to_pandas().columns)
+    assert all(type(x) in (int, float, str) for x in about.values())  # for GraphML
 
 
 def test_a_cell_of_several_colonies_needs_its_colony(whole):

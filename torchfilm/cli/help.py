@@ -21,7 +21,7 @@ WIDTH = 100
 @dataclass
 class Help:
     """Print the signature and the docstring of a public name, and its methods; without a name, list
-    all public names."""
+    all public names. For a command, such as export, see `torchfilm export --help`."""
 
     name: Annotated[str, tyro.conf.Positional] = ""
     """Such as Growth, tf.Circuit.from_sbml, parts.repressed or design.Stripe."""

@@ -39,9 +39,15 @@ class Removal(Effect):
     by_kernels = True
 
     def __post_init__(self) -> None:
+        for name, corner in (("low", self.low), ("high", self.high)):
+            if not hasattr(corner, "__len__"):
+                raise checks.input_error(
+                    f"Removal.{name}", corner, "2 or 3 numbers, such as (20.0, math.inf)",
+                    "±inf means no limit along that axis.",
+                )  # fmt: skip
         low, high = _or_no_limits(self.low, self.high, -math.inf), self.high
         high = _or_no_limits(high, low, math.inf)
-        if isinstance(low, tuple) and not low:
+        if not len(low) and not len(high):
             raise checks.InputError("Removal() has no limits: give low, high, or both.")
         for name, corner in zip(("low", "high"), checks.corners("Removal", low, high), strict=True):
             object.__setattr__(self, name, corner)
@@ -64,9 +70,13 @@ class Removal(Effect):
 
     def check(self, state: State, values: Values) -> None:
         if len(self.low) != state.dim:
-            raise checks.input_error(
-                "Removal.low", self.low, f"of {state.dim} numbers in a {state.dim}-D scene"
+            given = (
+                "high" if all(isinstance(x, float) and x == -math.inf for x in self.low) else "low"
             )
+            raise checks.input_error(
+                f"Removal.{given}", getattr(self, given),
+                f"of {state.dim} numbers in a {state.dim}-D scene",
+            )  # fmt: skip
         why = f"outside {self.low} to {self.high}. Move the cell or the region."
         check_none_taken("Removal", state, self._outside(state, values), why)
 

@@ -15,8 +15,8 @@
     /obstacles            scenes with obstacles only: 1 in the voxels of the first frame in which no
                           signal can be, for pictures
     /parameters/PATH      (B,), parameters with one value per colony: see `torchfilm.io.parameters`
-    /lineage/births       colony_id, uid, parent, step, length
-    /lineage/ends         colony_id, uid, step, fate, length
+    /lineage/births       colony_id, uid, parent, step, length, time
+    /lineage/ends         colony_id, uid, step, fate, length, time
 
 A frame holds the whole state, so every frame is a checkpoint. `frames/step` is written last: a
 frame without an entry there is incomplete and is ignored. Files contain data only; torchfilm
@@ -57,9 +57,10 @@ CHUNK_ROWS, CHUNK_VOXELS = 512, 32768  # at most so many voxels
 CHUNK_BYTES = 1024  # of the tables that are not compressed
 BLANK = {"f": np.nan, "i": -1}  # between frames, by the kind of dtype
 LINEAGE = {
-    "births": ("colony_id", "uid", "parent", "step", "length"),
-    "ends": ("colony_id", "uid", "step", "fate", "length"),
+    "births": ("colony_id", "uid", "parent", "step", "length", "time"),
+    "ends": ("colony_id", "uid", "step", "fate", "length", "time"),
 }
+LINEAGE_NUMBERS = ("length", "time")  # µm and h; older files lack one or both
 # step last: it commits the frame
 FRAME_COLUMNS = ("first_row", "counts", "next_uid", "births", "ends", "time", "step")
 
@@ -198,5 +199,5 @@ def create_tables(file: h5py.File, state: State) -> None:
             create_table(file, f"frames/grid/{name}", value.dtype, value.shape)
     for table, columns in LINEAGE.items():
         for name in columns:
-            dtype = np.float64 if name == "length" else np.int64
+            dtype = np.float64 if name in LINEAGE_NUMBERS else np.int64
             create_table(file, f"lineage/{table}/{name}", dtype, ())

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
-from torchfilm.io.layout import LINEAGE
+from torchfilm.io.layout import LINEAGE, LINEAGE_NUMBERS
 from torchfilm.io.reading import blaming_file, committed, read_dataset
 from torchfilm.io.table import Tables, data_frame, needed
 from torchfilm.state import FATES
@@ -21,14 +21,16 @@ if TYPE_CHECKING:
     from torchfilm.io.results import Results
 
 COLUMNS = (
-    "colony", "cell", "parent", "founder", "born", "ended", "fate", "birth_length", "end_length",
+    "colony", "cell", "parent", "sister", "founder", "generation", "pole_age", "born", "ended",
+    "fate", "birth_length", "end_length",
 )  # fmt: skip
+RELATIONS = ("mother", "sister", "cousin")
 
 
 def _column(file: h5py.File, name: str, count: int) -> np.ndarray:
     """The first rows of a table's column; NaN where an older file does not have it."""
     with blaming_file(file, name):
-        lacks = name.endswith("/length") and bool(file) and name not in file
+        lacks = name.split("/")[-1] in LINEAGE_NUMBERS and bool(file) and name not in file
     if lacks:
         return np.full(count, np.nan)
     return read_dataset(file, name, slice(count))
@@ -38,12 +40,15 @@ class Lineage:
     """Every cell of a recorded run, as arrays (N,), and as a tree.
 
     colony: id of its colony · cell: its uid, unique within the colony · parent: uid, −1 for
-    founders · born: h; the founders' is the start of the run, and that of cells which a run found
-    in the middle of another is not known, NaN · ended: h, NaN while it lives · fate: "alive",
-    "divided", "removed", "left", "lysed", "eroded", "sloughed" or "failed" · birth_length,
-    end_length: of the centreline, µm, when it was born and ended; NaN where that hour is NaN, and
-    in files of earlier versions but for founders · founder: uid of the first of its line in the
-    file.
+    founders · sister: uid of the other daughter of its mother, −1 where the file has none ·
+    generation: divisions since the first of its line in the file · pole_age: divisions since the
+    older of its poles was formed, as far as the file goes back: 1 is the least of a daughter, and
+    the mother of a dead-end channel has her generation · born: h; the founders' is the start of the
+    run, and that of cells which a run found in the middle of another is not known, NaN · ended: h,
+    NaN while it lives · fate: "alive", "divided", "removed", "left", "lysed", "eroded", "sloughed"
+    or "failed" · birth_length, end_length: of the centreline, µm, when it was born and ended; NaN
+    where that hour is NaN, and in files of earlier versions but for founders · founder: uid of the
+    first of its line in the file.
 
     Cells are named by uid, and in a run of several colonies by `colony`, an id, too. `course` reads
     the file, which must be open. Raises InputError for cells and colonies that the run does not
@@ -67,7 +72,11 @@ class Lineage:
         self.cell: np.ndarray = np.concatenate([first["uid"], births["uid"]])
         self.parent: np.ndarray = np.concatenate([first["parent"], births["parent"]])
         founded = np.where((first["parent"] < 0) & (steps[0] == 0), times[0], np.nan)
-        self.born: np.ndarray = np.concatenate([founded, np.interp(births["step"], steps, times)])
+        # files of earlier versions have the step only
+        hours = lambda t: np.where(
+            np.isnan(t["time"]), np.interp(t["step"], steps, times), t["time"]
+        )
+        self.born: np.ndarray = np.concatenate([founded, hours(births)])
         lengths = np.where(np.isnan(founded), np.nan, first["length"])
         self.birth_length: np.ndarray = np.concatenate([lengths, births["length"]])
         self.ended, self.end_length = (np.full(len(self.cell), np.nan) for _ in range(2))
@@ -75,7 +84,7 @@ class Lineage:
         self._order = np.argsort(_pair(self.colony, self.cell))
         self._keys = _pair(self.colony, self.cell)[self._order]
         at = self._rows(ends["colony_id"], ends["uid"])
-        self.ended[at] = np.interp(ends["step"], steps, times)
+        self.ended[at] = hours(ends)
         if not np.isin(ends["fate"], np.arange(len(FATES))).all():
             raise InputError(
                 f"{self._path} is damaged: it has ends of no known fate. Use another copy of it."
@@ -91,8 +100,8 @@ class Lineage:
         return f"Lineage({len(self)} cells in {colonies} colonies, {self.now:g} h)"
 
     def to_pandas(self) -> Any:
-        """A pandas.DataFrame with one row per cell: colony, cell, parent, founder, born, ended,
-        fate, birth_length, end_length."""
+        """A pandas.DataFrame with one row per cell: colony, cell, parent, sister, founder,
+        generation, pole_age, born, ended, fate, birth_length, end_length."""
         return data_frame({name: getattr(self, name) for name in COLUMNS})
 
     def born_of(self, colony: np.ndarray, cell: np.ndarray) -> np.ndarray:
@@ -122,6 +131,53 @@ class Lineage:
         while not np.array_equal(above := root[root], root):  # twice as far up each time
             root = above
         return self.cell[root]
+
+    @cached_property
+    def generation(self) -> np.ndarray:
+        found, at = np.zeros(len(self), np.int64), self._mothers
+        while (later := at >= 0).any():
+            found += later
+            at = np.where(later, self._mothers[at], -1)
+        return found
+
+    @cached_property
+    def sister(self) -> np.ndarray:
+        return np.where(self._sisters < 0, -1, self.cell[self._sisters])
+
+    @cached_property
+    def pole_age(self) -> np.ndarray:
+        # the daughter with the lower number keeps the end against its mother's axis, the other one
+        # the end along it
+        ages, lower = np.zeros((2, len(self)), np.int64), self.cell < self.sister
+        for generation in range(1, int(self.generation.max(initial=0)) + 1):
+            rows = np.flatnonzero(self.generation == generation)
+            kept = np.where(lower[rows], 0, 1)
+            ages[kept, rows] = ages[kept, self._mothers[rows]] + 1
+        return ages.max(0)
+
+    def pairs(self, relation: str) -> np.ndarray:
+        """The rows of related cells, (P, 2), each pair once: "mother" and her daughter, "sister"s,
+        or first "cousin"s. As in `table.iloc[pairs[:, 0]]`."""
+        checks.choice("relation", relation, RELATIONS)
+        every = np.arange(len(self))
+        if relation == "mother":
+            daughters = every[self._mothers >= 0]
+            return np.stack([self._mothers[daughters], daughters], 1)
+        first = every[self._sisters > every]
+        sisters = np.stack([first, self._sisters[first]], 1)
+        if relation == "sister":
+            return sisters
+        of = np.full((len(self), 2), -1)  # the daughters of each cell
+        for k in range(2):
+            daughters = sisters[self._mothers[sisters[:, k]] >= 0, k]
+            of[self._mothers[daughters], k] = daughters
+        both = [
+            np.stack([of[sisters[:, 0], i], of[sisters[:, 1], j]], 1)
+            for i in (0, 1)
+            for j in (0, 1)
+        ]
+        found = np.concatenate(both)
+        return found[(found >= 0).all(1)]
 
     def clone_sizes(self, colony: int | None = None) -> dict[int, int]:
         """How many living cells descend from each founder of a colony, by its uid; 0 for a line
@@ -173,17 +229,10 @@ class Lineage:
 
     def to_networkx(self, colony: int | None = None) -> Any:
         """The trees of one colony, or of all, as a networkx.DiGraph from mother to daughter. Nodes
-        are (colony, cell), with the attributes colony, cell, born, ended (h) and fate."""
+        are (colony, cell), with the table's columns as attributes."""
         graph = needed("networkx", "tables").DiGraph()
         for row in self._of(colony):
-            colony_id, cell = self._node(row)
-            about = {
-                "colony": colony_id,
-                "cell": cell,
-                "born": float(self.born[row]),
-                "ended": float(self.ended[row]),
-                "fate": str(self.fate[row]),
-            }
+            about = {name: getattr(self, name)[row].item() for name in COLUMNS}
             graph.add_node(self._node(row), **about)
             if self._mothers[row] >= 0:
                 graph.add_edge(self._node(self._mothers[row]), self._node(row))
@@ -211,6 +260,18 @@ class Lineage:
         found = np.where(known, self._order[at], -1)
         if (found >= np.arange(len(found))).any():
             raise InputError(f"{self._path} is damaged: a cell descends from a later one.")
+        return found
+
+    @cached_property
+    def _sisters(self) -> np.ndarray:
+        """(N,) the row of the other daughter of each cell's mother, −1 where the file has none."""
+        found = np.full(len(self), -1)
+        known = np.flatnonzero(self.parent >= 0)
+        mother = _pair(self.colony, self.parent)[known]
+        order = np.argsort(mother, kind="stable")
+        rows, mother = known[order], mother[order]
+        same = np.flatnonzero(mother[1:] == mother[:-1])
+        found[rows[same]], found[rows[same + 1]] = rows[same + 1], rows[same]
         return found
 
     @cached_property

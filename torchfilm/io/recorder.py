@@ -304,14 +304,14 @@ class Recorder(metaclass=checks.KnownKeywords):
         for b in state.births:
             parents = torch.cat([b.parents.uid, b.parents.uid])
             ids = torch.cat([b.parents.own_colony_id, b.parents.own_colony_id])
-            steps = np.full(parents.numel(), state.step)
+            steps, times = (np.full(parents.numel(), x) for x in (state.step, state.time))
             own = (numpy_of(x) for x in (ids, b.uid, parents))
-            self.births.append((*own, steps, numpy_of(b.length)))
+            self.births.append((*own, steps, numpy_of(b.length), times))
         for e in state.ended:
-            steps = np.full(e.uid.numel(), state.step)
+            steps, times = (np.full(e.uid.numel(), x) for x in (state.step, state.time))
             fates = np.full(e.uid.numel(), FATES.index(e.fate))
             own = (numpy_of(x) for x in (e.colony_id, e.uid))
-            self.ends.append((*own, steps, fates, numpy_of(e.length)))
+            self.ends.append((*own, steps, fates, numpy_of(e.length), times))
 
     def _write(self, state: State) -> None:
         assert self.file is not None
@@ -397,7 +397,7 @@ class Recorder(metaclass=checks.KnownKeywords):
                 else [np.empty(0, np.int64)] * len(names)
             )
             for name, value in zip(names, merged, strict=True):
-                if f"lineage/{table}/{name}" in file:  # older files have no lengths
+                if f"lineage/{table}/{name}" in file:  # older files have no lengths, or times
                     self._append(f"lineage/{table}/{name}", value, sizes[table])
             sizes[table] += len(merged[0])
         for name, value in colony_columns(state).items():

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
-from torchfilm.io.layout import AT_CELLS, LINEAGE
+from torchfilm.io.layout import AT_CELLS, LINEAGE, LINEAGE_NUMBERS
 from torchfilm.tools.checks import InputError
 
 if TYPE_CHECKING:
@@ -27,7 +27,12 @@ DATASETS = {
     **{f"frames/{n}": (WHOLE, 1) for n in ("first_row", "births", "ends", "step")},
     **{f"frames/{n}": (WHOLE, 2) for n in ("counts", "next_uid")},
     "frames/time": (NUMBER, 1),
-    **{f"lineage/{t}/{n}": (WHOLE, 1) for t in LINEAGE for n in LINEAGE[t] if n != "length"},
+    **{
+        f"lineage/{t}/{n}": (WHOLE, 1)
+        for t in LINEAGE
+        for n in LINEAGE[t]
+        if n not in LINEAGE_NUMBERS
+    },
 }
 GRID = {"origin": (NUMBER, 3), "shape": (WHOLE, 3), "first_voxel": (WHOLE, 1)}
 OF_GROWTH = ("growth_rate", "division_threshold")  # fields without which no cell grows or divides
