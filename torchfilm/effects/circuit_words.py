@@ -35,10 +35,10 @@ def methods_of(
     )
     lines = [said.get(circuit.method, explicit)]
     why = [f"computed by torch: {x}" for x in why_torch]
-    lines += why or [
-        "computed by compiled functions of its equations; where gradients are required by torch,"
-        " with derivatives from them"
-    ]
+    gradients = "; where gradients are required by torch, with derivatives from them"
+    if circuit.method == "rosenbrock":
+        gradients = ", gradients too"
+    lines += why or [f"computed by compiled functions of its equations{gradients}"]
     if exchanged:
         lines.append(
             f"exchanges {', '.join(exchanged)} with each cell's own pool: amounts kept to rounding;"

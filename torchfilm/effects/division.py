@@ -172,13 +172,13 @@ class Division(Effect):
         short = torch.nonzero(least < needed * (1 - 1e-6)).squeeze(1)
         if short.numel():
             k = int(short[0])
-            share, added = float(small[k]), self.criterion == "added"
-            can = f"is {float(least[k]):g} at most" if added else f"can be {float(least[k]):g}"
+            share, adder = float(small[k]), self.criterion == "added"
+            can = f"is {float(least[k]):g} at most" if adder else f"can be {float(least[k]):g}"
             raise checks.InputError(
                 f"Division.{self.criterion} {can}: it must be at least"
                 f" {float(needed[k]):g} for radius {float(state.radius[k]):g} µm"
                 + (f" and a fraction of {share:g}" if share < 0.5 else "")
-                + (", or daughters get shorter, until they" if added else ", or the daughters")
+                + (", or daughters get shorter, until they" if adder else ", or the daughters")
                 + " would have a negative length (each has two caps). Raise the"
                 " threshold" + (", or take a fraction nearer to 0.5." if share < 0.5 else ".")
             )
