@@ -184,3 +184,25 @@ def test_no_cells(plain):
     state = model.start()
     state = state.remove(torch.ones(state.cells, dtype=torch.bool), "removed")
     assert model.step(state, 0.3).cells == 0
+
+
+def overflows(u, s, p, cell):
+    return {"a": p.k * u.a * p.big, "b": 0 * u.b}
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_a_cell_that_fails_leaves_the_gradients_of_others(plain, backend):
+    """Its derivatives are infinite. It is reported as without gradients."""
+    k = torch.tensor(1.0, dtype=F64, requires_grad=True)
+    first = torch.tensor(1e-3, dtype=F64, requires_grad=True)
+    constants = {"k": k, "big": torch.tensor([1.0, 3e4], dtype=F64)}
+    described = by(backend, scene(overflows, constants, initial={"a": first}))
+    model = described.bind(2, dtype=F64)
+    state = model.step(model.start(), 0.05)
+    with torch.no_grad():
+        still = model.step(model.start(), 0.05)
+    failures = [tf.failures(s)[0].colony_id for s in (state, still) if tf.failures(s)]
+    assert failures == [1, 1]
+    good = state.select([0])
+    found = torch.autograd.grad((good.a * good.volume).sum(), [k, first])
+    assert all(bool(x.isfinite()) and float(x) > 0 for x in found)

@@ -123,6 +123,27 @@ def test_the_module_of_a_script(text):
     assert module_of(Counts()) == __name__
 
 
+def test_a_rule_of_a_notebook_has_no_file():
+    """Its file is named by the text of its cell, which may change where the rule does not."""
+    made = of_script("/tmp/ipykernel_4711/2381196255.py", "def made(cells): pass")
+    assert module_of(made) == "__main__"
+
+
+def test_a_decorated_rule_is_that_of_its_own_file():
+    text = "import functools\ndef inner(cells): pass\nmade = functools.wraps(inner)(other)"
+    names = {"__name__": "__main__", "other": lambda cells: None}
+    exec(compile(text, "/somewhere/mine.py", "exec"), names)
+    assert module_of(names["made"]) == "mine"
+
+
+def test_an_object_whose_class_inherits_its_call():
+    made = of_script(
+        "/somewhere/mine.py",
+        "class Base:\n    def __call__(self, cells): pass\nclass Kind(Base): pass\nmade = Kind()",
+    )
+    assert module_of(made) == "mine"
+
+
 def test_in_a_process_that_a_script_starts(monkeypatch):
     made = of_script("/somewhere/mine.py", "def made(cells): pass")
     monkeypatch.setattr(made, "__module__", "__mp_main__")

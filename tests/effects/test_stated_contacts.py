@@ -72,9 +72,8 @@ def test_first_cells_that_fit_between_no_walls(wall, room):
         tf.Sphere((0.0, 0.0), 1.5),
         tf.Sphere((0.0, 0.0), 0.3, stiffness=100.0),
         tf.Sphere((0.0, 9.0), 0.3, inside=False),
-        tf.Box((-1.3, -1.3), (1.3, 1.3)),
+        tf.Box((-1.6, -1.6), (1.6, 1.6)),
         tf.Box((-1.0, -1.0), (1.0, 1.0), stiffness=100.0),
-        tf.Box((-1.0, -9.0), (1.0, math.inf)),
         tf.Channel(2.0, low_end=-1.0),
         tf.Plane(x=-0.5, facing="+x"),
     ],
@@ -103,3 +102,26 @@ def test_numbers_beyond_those_of_float32():
 def test_a_dimension_is_a_whole_number(make, dim):
     with pytest.raises(tf.InputError, match="one of 2, 3"):
         make(dim)
+
+
+def across(tilt: float, length: float = 2.0) -> tf.Scene:
+    """A cell across a channel of 1.2 µm."""
+    founders = tf.Cells([[2.0, 0.0]], [[tilt, 1.0]], length=[length])
+    mechanics = tf.Mechanics(dim=2, walls=[tf.Channel(1.2, low_end=0.0)])
+    return tf.Scene(tf.Growth(rate=1.0), mechanics, founders=founders, dt=0.05)
+
+
+def test_a_first_cell_straight_across_a_channel():
+    """Nothing turns it. One that leans a little, or that fits, is silent."""
+    words = r"Channel: cell 0 of colony 0, which is 3 µm long, starts straight across the 1\.2 µm"
+    with pytest.warns(RuntimeWarning, match=words):
+        across(0.0).bind()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        across(1e-4).bind()
+        across(0.0, length=0.19).bind()
+    for box in (tf.Box((-1.3, -1.3), (1.3, 1.3)), tf.Box((-1.0, -9.0), (1.0, math.inf))):
+        with pytest.warns(RuntimeWarning, match=r"^Box: cell 0 .* starts straight across the 2"):
+            tf.Scene(tf.Mechanics(dim=2, walls=[box])).bind()
+    *_, last = tf.simulate(across(1e-4), until=1.0)
+    assert float(last.axis[0, 0].abs()) > 0.9, "it lies along the channel"

@@ -358,6 +358,7 @@ def test_case_47_a_heap_parts(measured, dim, cells):
     assert measured("contacts deeper than 0.3 µm", share, "≤ 0.0002") <= 2e-4
 
 
+@pytest.mark.filterwarnings("ignore:Plane.* starts straight across:RuntimeWarning")
 def test_gradients_go_through_the_bound_on_what_a_pressed_cell_loses():
     """A cell that two walls press: before the bound acts, when it does, and after."""
 

@@ -68,7 +68,8 @@ class _Step(torch.autograd.Function):
         found = torch.zeros(slopes.shape[:2], dtype=slopes.dtype)
         # in the order of the variables, which fixes the bits
         for slope, above in zip(slopes.unbind(2), grad.to(slopes.dtype).unbind(1), strict=True):
-            found = torch.addcmul(found, slope, above)
+            # a cell that has failed may have infinite ones, of which none is asked for
+            found = found + torch.where(above == 0, 0.0, slope * above)
         of_start, own = found.split([ctx.of_start, len(found) - ctx.of_start])
         of_values = [
             (x if dim else x.sum()).to(dtype)

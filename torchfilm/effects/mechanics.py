@@ -21,7 +21,7 @@ from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
 from torchfilm.parameters import number_range
 from torchfilm.physics.adhesion import Adhesion, check_walls_of
 from torchfilm.physics.contact_records import ContactSettings
-from torchfilm.physics.initial_overlaps import check_apart, check_fits, check_room
+from torchfilm.physics.initial_overlaps import check_apart, check_fits, check_room, check_turned
 from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.space import PeriodicSpace, check_first_cells, check_walls_in
 from torchfilm.physics.surfaces import Surface
@@ -285,21 +285,11 @@ class Mechanics(Effect):
                     f" {-float(distance[k]):.3g} µm behind it (cells behind it: {behind.numel()})."
                     f" {surface.wall.turn_hint}"
                 )
-        check_room(self.surfaces(), state.position, state.radius, state.own_colony_id)
-        check_fits(
-            self.surfaces(), state.position, state.length, state.radius, state.own_colony_id,
-            state.uid,
-        )  # fmt: skip
-        check_apart(
-            state.position,
-            state.axis,
-            state.length,
-            state.radius,
-            state.colony,
-            state.colony_id,
-            state.uid,
-            space,
-        )
+        cells, ids = (state.position, state.axis, state.length, state.radius), state.own_colony_id
+        check_room(self.surfaces(), state.position, state.radius, ids)
+        if check_fits(self.surfaces(), state.position, *cells[2:], ids, state.uid):
+            check_turned(self.surfaces(), *cells, ids, state.uid)
+        check_apart(*cells, state.colony, state.colony_id, state.uid, space)
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         return (BoundMechanics(self, binding),)

@@ -15,6 +15,8 @@ from torchfilm.tools.warn_once import warn
 
 # Centres nearer than this share of a radius count as one place.
 SAME_PLACE = 1e-6
+# The part of an axis along a plane on which the cell stands, but for rounding.
+ACROSS = 1e-6
 
 
 @torch.no_grad()
@@ -97,8 +99,9 @@ def check_room(surfaces: Sequence[Surface], position: Tensor, radius: Tensor, id
 def check_fits(
     surfaces: Sequence[Surface], position: Tensor, length: Tensor, radius: Tensor, ids: Tensor,
     uid: Tensor,
-) -> None:  # fmt: skip
-    """Warn where a cell is longer than what a hard box or ball leaves it, however it lies.
+) -> bool:  # fmt: skip
+    """Warn where a cell is longer than what a hard box or ball leaves it, however it lies; whether
+    all fit.
 
     position (N, d); length, radius (N,) µm; ids (N,), of the cells' colonies; uid (N,).
     """
@@ -127,6 +130,35 @@ def check_fits(
                 f" {float(length[k] + 2 * radius[k]):.3g} µm long, and there is room for"
                 f" {max(0.0, float(most[k])) + 2 * float(radius[k]):.3g} µm: it will lie in the"
                 " wall. Make room, shorten the cell, or give the wall a stiffness.",
+                category=RuntimeWarning,
+            )
+            return False
+    return True
+
+
+@torch.no_grad()
+def check_turned(
+    surfaces: Sequence[Surface], position: Tensor, axis: Tensor, length: Tensor, radius: Tensor,
+    ids: Tensor, uid: Tensor,
+) -> None:  # fmt: skip
+    """Warn where a cell lies straight across two hard, parallel planes and is longer than what they
+    leave it: nothing turns it. Arguments as for `check_fits`, and axis (N, d).
+    """
+    flat = [s for s in surfaces if isinstance(s, FlatSurface) and not s.wall.yields]
+    for one, other in itertools.combinations(flat, 2):
+        (near, way), (far, back) = (s.gap_of_points(position, ids) for s in (one, other))
+        width, opposite = near + far, (way * back).sum(0) < -1 + 1e-9
+        turned = axis.T.double()
+        across = (turned - (way * turned).sum(0) * way).norm(dim=0) < ACROSS
+        jammed = opposite & across & (length + 2 * radius > width * (1 + 1e-6))
+        if bool(jammed.any()):
+            k, names = int(torch.nonzero(jammed)[0]), (type(s.wall).__name__ for s in (one, other))
+            warn(
+                f"{' and '.join(dict.fromkeys(names))}: cell {int(uid[k])} of colony {int(ids[k])},"
+                f" which is {float(length[k] + 2 * radius[k]):.3g} µm long, starts straight across"
+                f" the {float(width[k]):.3g} µm between two hard sides (such cells:"
+                f" {int(jammed.sum())}). It lies in both, and nothing turns it. Turn its axis a"
+                " little.",
                 category=RuntimeWarning,
             )
             return

@@ -19,12 +19,14 @@ log_sigmoid and the four operations.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
+
+from torchfilm.tools.row_products import linear
 
 # Larger integer exponents use exp and log, whose error is then smaller.
 MAX_SQUARED = 64
@@ -166,7 +168,8 @@ def logit(x: Tensor, eps: float | None = None) -> Tensor:
 
 def atan2(y: Tensor, other: Tensor) -> Tensor:
     """The angle of (x, y), from −π to π; x: `other`, as torch calls it."""
-    x = other
+    infinite = torch.isinf(y) & torch.isinf(other)
+    y, x = (torch.where(infinite, torch.sign(z), z) for z in (y, other))
     steep = y.abs() > x.abs()
     over, under = torch.where(steep, x, y), torch.where(steep, y, x)
     none = under == 0  # both are
@@ -207,41 +210,45 @@ def rsqrt(x: Tensor) -> Tensor:
 
 
 def hypot(x: Tensor, other: Tensor) -> Tensor:
-    """√(x² + y²)."""
-    return torch.sqrt(x * x + other * other)
-
-
-def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """x Wᵀ + b with x (…, K), W (M, K), b (M,), one column of x after the other.
-
-    A matrix product adds in an order that depends on the number of rows. Precisions may differ,
-    as in the four operations: a stiff solver calls in float64 what a module holds in float32.
-    """
-    terms = zip(x.unsqueeze(-1).unbind(-2), weight.unbind(-1), strict=True)
-    out = sum((column * row for column, row in terms), x.new_zeros(()))
-    return out if bias is None else out + bias
+    """√(x² + y²), also where a square would be beyond the numbers of the type."""
+    x, other = x.abs(), other.abs()
+    far, near = torch.maximum(x, other), torch.minimum(x, other)
+    part = near / torch.where((far > 0) & (far < torch.inf), far, 1.0)
+    return torch.where(far < torch.inf, far * torch.sqrt(1.0 + part * part), far)
 
 
 def _linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor | None:
-    fits = x.dim() > 0 and weight.dim() == 2 and x.shape[-1] == weight.shape[1]
-    if isinstance(x, Tensor) and x.layout is not torch.strided:  # rows of sparse matrices add alone
+    if not _is_plain(x) or not _is_plain(weight):
         return None
-    return linear(x, weight, bias) if fits and x.is_floating_point() else None
+    fits = x.dim() > 0 and weight.dim() == 2 and 0 < x.shape[-1] == weight.shape[1]
+    return linear(x, weight, bias) if fits else None
 
 
 def _matmul(x: Tensor, y: Tensor) -> Tensor | None:
-    return _linear(x, y.t()) if isinstance(x, Tensor) and y.dim() == 2 else None
+    if not _is_plain(x) or not _is_plain(y) or x.dim() == 0:
+        return None
+    if y.dim() == 1:
+        found = _linear(x, y.unsqueeze(0))
+        return None if found is None else found.squeeze(-1)
+    return _linear(x, y.t()) if y.dim() == 2 else None
+
+
+def _is_plain(x: object) -> bool:
+    """Whether it is a tensor of real numbers that lie in rows, as those of cells do."""
+    return isinstance(x, Tensor) and x.layout is torch.strided and x.dtype in FLOOR
 
 
 def _pow(x: Tensor | float, n: float | Tensor) -> Tensor | None:
     if isinstance(x, Tensor):
-        if (
-            not x.is_floating_point()
-            or isinstance(n, (bool, complex))
-            or (isinstance(n, Tensor) and not n.is_floating_point() and n.dim() == 0)
-        ):
+        if not _is_plain(x) or isinstance(n, bool) or not isinstance(n, (int, float, Tensor)):
             return None
-        return power(x, n.to(x.dtype) if isinstance(n, Tensor) and not n.is_floating_point() else n)
+        if isinstance(n, Tensor):
+            whole = not n.is_floating_point()
+            if n.layout is not torch.strided or n.is_complex() or (whole and n.dim() == 0):
+                return None
+            common = torch.result_type(x, n)
+            return power(x.to(common), n.to(common) if whole else n)
+        return power(x, n)
     return _rpow(n, x) if isinstance(n, Tensor) else None
 
 
@@ -281,8 +288,7 @@ def _mean(x: Tensor, dim: Any = None, keepdim: Any = False, **other: Any) -> Ten
 
 def _floating(function: Callable[..., Tensor | None]) -> Callable[..., Tensor | None]:
     def replaced(input: Tensor, *args: Any, **kwargs: Any) -> Tensor | None:
-        fits = isinstance(input, Tensor) and input.is_floating_point()
-        return function(input, *args, **kwargs) if fits else None
+        return function(input, *args, **kwargs) if _is_plain(input) else None
 
     return replaced
 
@@ -309,7 +315,7 @@ REPLACEMENTS: dict[Callable[..., Any], Callable[..., Tensor | None]] = {
     **dict.fromkeys((torch.logit, Tensor.logit, torch.special.logit), _floating(logit)),
     **dict.fromkeys((torch.sum, Tensor.sum), _floating(_sum)),
     **dict.fromkeys((torch.mean, Tensor.mean), _floating(_mean)),
-    Tensor.sigmoid_: lambda x: x.copy_(sigmoid(x)),
+    Tensor.sigmoid_: _floating(lambda x: x.copy_(sigmoid(x))),
     torch.nn.functional.selu: _floating(selu),
     torch.nn.functional.celu: _floating(celu),
     torch.nn.functional.mish: _floating(mish),
@@ -320,18 +326,42 @@ REPLACEMENTS: dict[Callable[..., Any], Callable[..., Tensor | None]] = {
     torch.nn.functional.silu: _floating(silu),
     torch.nn.functional.elu: _floating(elu),
     torch.nn.functional.linear: _linear,
-    **dict.fromkeys((torch.matmul, torch.mm, Tensor.matmul, Tensor.mm, Tensor.__matmul__), _matmul),
+    **dict.fromkeys((torch.matmul, Tensor.matmul, Tensor.__matmul__), _matmul),
+    **dict.fromkeys((torch.mv, Tensor.mv, torch.mm, Tensor.mm), _matmul),
 }
+# Where each of these is told to write into its argument, among what it is given.
+IN_PLACE = {
+    torch.nn.functional.silu: 1, torch.nn.functional.mish: 1, torch.nn.functional.selu: 1,
+    torch.nn.functional.elu: 2, torch.nn.functional.celu: 2,
+}  # fmt: skip
+# Torch's names of first and second arguments.
+FIRST, SECOND = ("input", "self"), ("exponent", "other", "mat2", "vec", "weight")
 
 
 class _DeterministicMode(TorchFunctionMode):
     def __torch_function__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
         replacement = REPLACEMENTS.get(func)
-        if replacement is not None and not (kwargs and "out" in kwargs):
-            found = replacement(*args, **(kwargs or {}))
+        if replacement is not None and "out" not in kwargs:
+            given, named = (args, kwargs) if not kwargs else _in_order(args, kwargs)
+            found = replacement(*given, **named)
             if found is not None:
-                return found
-        return func(*args, **(kwargs or {}))
+                at = IN_PLACE.get(func, len(given))
+                inside = named.get("inplace") or (at < len(given) and given[at])
+                return given[0].copy_(found) if inside else found
+        return func(*args, **kwargs)
+
+
+def _in_order(
+    args: Sequence[Any], kwargs: Mapping[str, Any]
+) -> tuple[Sequence[Any], dict[str, Any]]:
+    """The arguments with the first two by their place, if these were given by name."""
+    args, rest = list(args), dict(kwargs)
+    for place, names in enumerate((FIRST, SECOND)):
+        for name in names:
+            if len(args) == place and name in rest:
+                args.append(rest.pop(name))
+    return args, rest
 
 
 def deterministic_functions() -> TorchFunctionMode:
@@ -340,7 +370,7 @@ def deterministic_functions() -> TorchFunctionMode:
     It covers pow and **, rsqrt, sigmoid, exp2, sinh, cosh, atanh, softplus, silu, elu, selu, celu,
     mish, gelu, logit, logaddexp, hypot, atan2, linear layers, products with a matrix (K, M), and
     sums and means over an axis of up to MOST_COLUMNS, in the forward and reverse modes of autograd.
-    It does not cover gammainc, products with batches of matrices, and other forms in place.
+    It does not cover gammainc, einsum, products with batches of matrices, and other forms in place.
     The cost is about a microsecond per torch call.
     """
     return _DeterministicMode()

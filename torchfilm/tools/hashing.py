@@ -9,6 +9,7 @@ import re
 import sys
 from collections.abc import Mapping
 from functools import partial
+from inspect import unwrap
 from pathlib import Path
 from types import CodeType, FunctionType, MethodType
 from typing import Any
@@ -143,14 +144,18 @@ def _script(name: str, thing: object = None) -> str:
     """The name by which the script that runs is imported; `name` where there is no file of it.
     thing: defined there; another process may have sent it."""
     main = sys.modules.get("__main__")
-    code = getattr(thing, "__code__", None)
+    code = getattr(unwrap(thing) if callable(thing) else thing, "__code__", None)
     if code is None:  # an object that is called
-        code = getattr(vars(type(thing)).get("__call__"), "__code__", None)
+        own = [vars(c)["__call__"] for c in type(thing).__mro__ if "__call__" in vars(c)]
+        code = getattr(own[0], "__code__", None) if own else None
     file = getattr(main, "__file__", None) if code is None else code.co_filename
     spec = getattr(main, "__spec__", None)
     if spec is not None and file == spec.origin:  # by `python -m`
         return str(spec.name)
-    return Path(file).stem if file and Path(file).suffix == ".py" else name
+    in_notebook = file and Path(file).parent.name.startswith(
+        "ipykernel_"
+    )  # of one cell, by its text
+    return Path(file).stem if file and Path(file).suffix == ".py" and not in_notebook else name
 
 
 def _is_plain_object(thing: Any) -> bool:
