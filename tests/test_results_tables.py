@@ -258,15 +258,19 @@ def test_names_of_parameters_are_as_short_as_they_can_be():
         "Division.length.low",
         "Division.length.high",
         "Mechanics.walls[0].low[1]",
+        "Division.added.mean",
+        "Circuit.parameters['sd']",
     ]
     assert list(column_names(paths, {"x", "length", "rate"}).values()) == [
         "k",
         "Growth.rate",
         "a.diffusion",
         "b.diffusion",
-        "low",
-        "high",
+        "length.low",
+        "length.high",
         "low[1]",
+        "added.mean",
+        "sd",
     ]
 
 

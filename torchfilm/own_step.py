@@ -17,8 +17,9 @@ COLUMNS = (*PER_CELL, *PER_COLONY)
 def taken(
     name: str, step: Callable[[], object], state: State, writes: Collection[str]
 ) -> State:  # fmt: skip
-    """The state that an effect of this name makes of a state by `step()`. The bits of a colony do
-    not depend on the colonies beside it. Raises as `check_step`."""
+    """The state that an effect of this name makes of a state by `step()`, in which a colony's bits
+    do not depend on others where `deterministic_functions` covers what it calls. Raises as
+    `check_step`."""
     before = seen(state)
     with deterministic_functions():
         made = step()

@@ -21,7 +21,8 @@ from torchfilm.tools.tangents import refuse_second
 if TYPE_CHECKING:
     from torchfilm.circuits.compiled_stiff import CompiledTangents
 
-# Numbers that a cell may depend on: with more of them torch's graph is as fast in large colonies.
+# Numbers that a cell may depend on: with more of them torch's graph is as fast in some thousand
+# cells. Each of them takes another run of the steps.
 MOST_DIRECTIONS = 64
 # Cells times directions that are worked on at once, for the sake of memory.
 AT_ONCE = 1 << 17

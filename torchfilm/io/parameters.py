@@ -12,11 +12,13 @@ import h5py
 import numpy as np
 from torch import Tensor
 
+from torchfilm.distributions import LogNormal, Normal, Uniform
 from torchfilm.io.layout import numpy_of
 from torchfilm.io.reading import blaming_file
 from torchfilm.scene import Scene
 
 NOW, UNTIL = "parameters", "parameters_until"
+OF_DISTRIBUTIONS = {n for kind in (Uniform, Normal, LogNormal) for n in kind.parameters}
 SLASH = "\u2215"  # in a path, for the "/" that separates HDF5 groups
 
 
@@ -75,7 +77,8 @@ def _values(group: h5py.Group) -> dict[str, np.ndarray]:
 
 def column_names(paths: list[str], taken: set[str]) -> dict[str, str]:
     """A column for each parameter: the shortest end of its path that no other column has, such as
-    "k1" for "Circuit.parameters['k1']", and "Division.length" beside the cells' length."""
+    "k1" for "Circuit.parameters['k1']", "Division.length" beside the cells' length, and
+    "added.mean" of a distribution, whose own names say little."""
     ends = {path: _ends(path) for path in paths}
     names = {}
     for path in paths:
@@ -89,4 +92,6 @@ def _ends(path: str) -> list[str]:
     "Medium.signals['ahl'].diffusion", and "light[0.5]" of a schedule's value from 0.5 h."""
     plain = re.sub(r"\['([^']*)'\]", r".\1", path).replace(".values[", "[")
     words = re.split(r"\.(?![^\[]*\])", plain)
-    return [".".join(words[k:]) for k in range(len(words) - 1, -1, -1)]
+    own = words[-1] in OF_DISTRIBUTIONS and words[-2:-1] not in ([], ["parameters"])
+    last = len(words) - 1 - own
+    return [".".join(words[k:]) for k in range(last, -1, -1)]

@@ -77,7 +77,6 @@ class JointTransport:
     def _far(self) -> list[Any]:
         """Of each of `grid.batches`, (b,), the colonies that needed backward Euler: they keep to
         it, or the two would alternate. An array where kernels took the last pass, else a tensor."""
-
         return [None] * len(self.carried)
 
     @cached_property

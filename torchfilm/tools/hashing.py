@@ -152,10 +152,10 @@ def _script(name: str, thing: object = None) -> str:
     spec = getattr(main, "__spec__", None)
     if spec is not None and file == spec.origin:  # by `python -m`
         return str(spec.name)
-    in_notebook = file and Path(file).parent.name.startswith(
-        "ipykernel_"
-    )  # of one cell, by its text
-    return Path(file).stem if file and Path(file).suffix == ".py" and not in_notebook else name
+    if not file or Path(file).suffix != ".py":
+        return name
+    # a notebook names the file of a cell by the text of the cell, which may change
+    return name if Path(file).parent.name.startswith("ipykernel_") else Path(file).stem
 
 
 def _is_plain_object(thing: Any) -> bool:
