@@ -76,7 +76,7 @@ def test_drawn_thresholds_are_drawn_anew_for_each_daughter(criterion):
 
 
 def test_birth_length_of_the_adder_is_the_daughters_own():
-    scene = tf.Scene(tf.Division(added=2.0, fraction=0.375), founders=row_of_cells(1, 3.0))
+    scene = tf.Scene(tf.Division(added=1.0, fraction=0.375), founders=row_of_cells(1, 3.0))
     state = step(scene, flagged(scene), 0.1)
     assert torch.equal(state.birth_length, state.length)
     assert state.birth_length.tolist() == [0.5, 1.5]

@@ -210,33 +210,3 @@ def test_exactly_two_radii_may_divide():
     """l = 2r leaves two spheres: the limit, and allowed."""
     scene = tf.Scene(tf.Division(), founders=row_of_cells(1, 1.0))
     assert step(scene, flagged(scene), 0.1).length.tolist() == [0.0, 0.0]
-
-
-@pytest.mark.parametrize(
-    ("given", "least"),
-    [
-        ({"added": 0.9}, "1 for radius"),
-        ({"added": tf.Uniform(0.5, 0.95)}, "1 for radius"),
-        ({"added": 0.6, "conserves": "volume"}, "0.666667 for radius"),
-        ({"added": 2.0, "fraction": 0.3}, "2.33333 for radius 0.5 µm and a fraction of 0.3"),
-    ],
-)
-def test_adders_whose_cells_would_get_ever_shorter_are_refused(given, least):
-    """A cell of length l has daughters of (l + added)/2 − r, which tends to added − 2r."""
-    with pytest.raises(tf.InputError, match=rf"Division\.added is .* at most: .* {least}"):
-        tf.Scene(tf.Division(**given), founders=row_of_cells(1)).bind().start()
-
-
-@pytest.mark.parametrize(
-    "given",
-    [
-        {"added": 1.1},
-        {"added": 0.7, "conserves": "volume"},
-        {"added": tf.Uniform(0.9, 3.0)},
-        {"added": 2.0, "fraction": tf.Uniform(0.3, 0.7)},
-    ],
-)
-def test_adders_that_come_to_rest_grow_on(given):
-    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(**given), dim=2, dt=0.05)
-    *_, last = tf.simulate(scene, until=4.0)
-    assert last.cells >= 8 and float(last.length.min()) > 0

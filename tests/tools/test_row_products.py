@@ -62,6 +62,15 @@ def test_gradients_are_torchs(taken):
     assert torch.allclose(only, x.detach().sum(0).expand(5, 9))
 
 
+def test_many_directions_at_once():
+    x, weight, _ = (z.requires_grad_() for z in given((7,), torch.float64))
+    out = linear(x, weight)
+    directions = torch.randn(3, *out.shape, dtype=torch.float64)
+    many = torch.autograd.grad(out, (x, weight), directions, is_grads_batched=True)
+    assert torch.allclose(many[0], directions @ weight)
+    assert torch.allclose(many[1], directions.transpose(1, 2) @ x)
+
+
 def test_what_a_kernel_cannot_follow_is_left_to_torch(taken):
     x, weight, _ = given((6,), torch.float64)
     with forward_mode():
@@ -85,5 +94,8 @@ def test_products_in_rules_take_it(taken):
         assert len(taken) == 5
         assert torch.equal(x @ weight[0], linear(x, weight[:1])[:, 0])
         assert torch.equal(torch.mv(x, vec=weight[0]), x @ weight[0])
+        assert torch.equal(x[0] @ weight[0], torch.dot(x[0], weight[0]))  # left to torch
+        with pytest.raises(RuntimeError):
+            torch.mm(x[0], weight[0])
         assert (torch.ones(4, 0) @ torch.ones(0, 3)).shape == (4, 3)
         torch.testing.assert_close(torch.mm(x, turned.to_sparse()), expected)

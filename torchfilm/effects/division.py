@@ -161,25 +161,22 @@ class Division(Effect):
                 + _pixels_hint(float(state.length[k]), float(state.radius[k]))
                 + " Raise the threshold or start from smaller cells."
             )
+        if self.criterion == "added":
+            return
         # daughters keep the radius, so a cell's own threshold is compared with its own radius
         small = smaller_shares(self.fraction, values.fraction, state)
-        if self.criterion == "added":  # a small draw now and then does no harm
-            least = most
-            small = torch.full_like(small, 0.5) if is_drawn(self.fraction) else small
         needed = least_length(small, CAPS[self.conserves]) * state.radius
         if self.criterion == "volume":
             needed = capsule.volume(needed, state.radius)
         short = torch.nonzero(least < needed * (1 - 1e-6)).squeeze(1)
         if short.numel():
             k = int(short[0])
-            share, adder = float(small[k]), self.criterion == "added"
-            can = f"is {float(least[k]):g} at most" if adder else f"can be {float(least[k]):g}"
+            share = float(small[k])
             raise checks.InputError(
-                f"Division.{self.criterion} {can}: it must be at least"
+                f"Division.{self.criterion} can be {float(least[k]):g}: it must be at least"
                 f" {float(needed[k]):g} for radius {float(state.radius[k]):g} µm"
                 + (f" and a fraction of {share:g}" if share < 0.5 else "")
-                + (", or daughters get shorter, until they" if adder else ", or the daughters")
-                + " would have a negative length (each has two caps). Raise the"
+                + ", or the daughters would have a negative length (each has two caps). Raise the"
                 " threshold" + (", or take a fraction nearer to 0.5." if share < 0.5 else ".")
             )
 

@@ -40,7 +40,7 @@ class Removal(Effect):
 
     def __post_init__(self) -> None:
         for name, corner in (("low", self.low), ("high", self.high)):
-            if not hasattr(corner, "__len__"):
+            if not hasattr(corner, "__len__") or getattr(corner, "ndim", 1) == 0:
                 raise checks.input_error(
                     f"Removal.{name}", corner, "2 or 3 numbers, such as (20.0, math.inf)",
                     "±inf means no limit along that axis.",

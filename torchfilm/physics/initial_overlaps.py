@@ -151,14 +151,15 @@ def check_turned(
         turned = axis.T.double()
         across = (turned - (way * turned).sum(0) * way).norm(dim=0) < ACROSS
         jammed = opposite & across & (length + 2 * radius > width * (1 + 1e-6))
+        jammed &= 2 * radius <= width * (1 + 1e-6)  # of wider ones `check_room` warns
         if bool(jammed.any()):
             k, names = int(torch.nonzero(jammed)[0]), (type(s.wall).__name__ for s in (one, other))
             warn(
                 f"{' and '.join(dict.fromkeys(names))}: cell {int(uid[k])} of colony {int(ids[k])},"
                 f" which is {float(length[k] + 2 * radius[k]):.3g} µm long, starts straight across"
                 f" the {float(width[k]):.3g} µm between two hard sides (such cells:"
-                f" {int(jammed.sum())}). It lies in both, and nothing turns it. Turn its axis a"
-                " little.",
+                f" {int(jammed.sum())}). It lies in both, and contact does not turn it. Turn"
+                " its axis a little.",
                 category=RuntimeWarning,
             )
             return

@@ -51,6 +51,14 @@ class Mixing:
             out = out + down * torch.roll(v, -1, dim)
         return out
 
+    def pulled(self, v: Tensor) -> Tensor:
+        """Pᵀ v, for v (B, nx, ny, nz)."""
+        out = self.stay * v
+        for dim, up, down in self.gains:
+            out = out + torch.roll(up * v, -1, dim)
+            out = out + torch.roll(down * v, 1, dim)
+        return out
+
 
 @dataclass(frozen=True, eq=False)
 class Series:

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from torchfilm.signals.compiled_uptake import EVENTS, CompiledUptake, compiled_uptake
 from torchfilm.signals.grid import Shape
+from torchfilm.signals.series_sums import sums
 from torchfilm.signals.transport_iterative import prepare_backward_euler
 from torchfilm.signals.transport_operator import Operator
 from torchfilm.signals.transport_series import ABOVE, CUT, mixing_of, poisson
@@ -87,8 +88,5 @@ def _series(operator: Operator, rate: Tensor, dt: float, u: Tensor) -> tuple[Ten
     weights, tails = both_weights
     mixing = mixing_of(operator, rate.reshape(size))
     gain = None if operator.gain is None else operator.gain / rate.reshape(size)
-    end, total = weights[0].reshape(size) * u, tails[0].reshape(size) * u
-    for weight, tail in zip(weights[1:], tails[1:], strict=True):
-        u = mixing.of(u) if gain is None else mixing.of(u) + gain
-        end, total = end + weight.reshape(size) * u, total + tail.reshape(size) * u
+    end, total = sums(mixing, gain, weights, tails, u)
     return end, total / torch.where(events > 0, events, 1.0).reshape(size)

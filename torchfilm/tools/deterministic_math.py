@@ -31,7 +31,7 @@ from torchfilm.tools.row_products import linear
 # Larger integer exponents use exp and log, whose error is then smaller.
 MAX_SQUARED = 64
 # More numbers than so many along an axis are thought to be cells, and left to torch.
-MOST_COLUMNS = 64
+MOST_COLUMNS, MOST_TERMS = 64, 4096  # of a sum, and of a product
 # |x| at or below this counts as 0 where a logarithm is taken: the second derivative, ~ 1/x², must
 # not overflow the dtype.
 FLOOR = {torch.float32: 1e-18, torch.float64: 1e-150}
@@ -210,27 +210,30 @@ def rsqrt(x: Tensor) -> Tensor:
 
 
 def hypot(x: Tensor, other: Tensor) -> Tensor:
-    """√(x² + y²), also where a square would be beyond the numbers of the type."""
-    x, other = x.abs(), other.abs()
-    far, near = torch.maximum(x, other), torch.minimum(x, other)
-    part = near / torch.where((far > 0) & (far < torch.inf), far, 1.0)
-    return torch.where(far < torch.inf, far * torch.sqrt(1.0 + part * part), far)
+    """√(x² + y²)."""
+    return torch.sqrt(x * x + other * other)
 
 
 def _linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor | None:
     if not _is_plain(x) or not _is_plain(weight):
         return None
-    fits = x.dim() > 0 and weight.dim() == 2 and 0 < x.shape[-1] == weight.shape[1]
+    fits = x.dim() > 0 and weight.dim() == 2 and 0 < x.shape[-1] == weight.shape[1] <= MOST_TERMS
     return linear(x, weight, bias) if fits else None
 
 
 def _matmul(x: Tensor, y: Tensor) -> Tensor | None:
     if not _is_plain(x) or not _is_plain(y) or x.dim() == 0:
         return None
-    if y.dim() == 1:
+    if y.dim() == 1 and x.dim() > 1:
         found = _linear(x, y.unsqueeze(0))
         return None if found is None else found.squeeze(-1)
     return _linear(x, y.t()) if y.dim() == 2 else None
+
+
+def _of_matrix(x: Tensor, y: Tensor, dim: int) -> Tensor | None:
+    """The product of a matrix with one of `dim` axes; torch refuses others."""
+    fits = isinstance(x, Tensor) and isinstance(y, Tensor) and (x.dim(), y.dim()) == (2, dim)
+    return _matmul(x, y) if fits and x.dtype == y.dtype else None
 
 
 def _is_plain(x: object) -> bool:
@@ -246,8 +249,7 @@ def _pow(x: Tensor | float, n: float | Tensor) -> Tensor | None:
             whole = not n.is_floating_point()
             if n.layout is not torch.strided or n.is_complex() or (whole and n.dim() == 0):
                 return None
-            common = torch.result_type(x, n)
-            return power(x.to(common), n.to(common) if whole else n)
+            return power(x, n.to(x.dtype) if whole else n)
         return power(x, n)
     return _rpow(n, x) if isinstance(n, Tensor) else None
 
@@ -267,6 +269,8 @@ def _ipow(x: Tensor, n: float | Tensor) -> Tensor | None:
 
 def _sum(x: Tensor, dim: Any = None, keepdim: Any = False, **other: Any) -> Tensor | None:
     """The sum over one axis of a few numbers, in their order."""
+    dim = other.pop("axis", dim)  # NumPy's name of it
+    dim = dim[0] if isinstance(dim, (tuple, list)) and len(dim) == 1 else dim
     one_axis = type(dim) is int and type(keepdim) is bool and not other
     if (
         not one_axis
@@ -283,7 +287,9 @@ def _sum(x: Tensor, dim: Any = None, keepdim: Any = False, **other: Any) -> Tens
 
 def _mean(x: Tensor, dim: Any = None, keepdim: Any = False, **other: Any) -> Tensor | None:
     found = _sum(x, dim, keepdim, **other)
-    return None if found is None else found / x.shape[dim]
+    if found is None or not found.numel():
+        return found
+    return found / (x.numel() // found.numel())
 
 
 def _floating(function: Callable[..., Tensor | None]) -> Callable[..., Tensor | None]:
@@ -327,7 +333,8 @@ REPLACEMENTS: dict[Callable[..., Any], Callable[..., Tensor | None]] = {
     torch.nn.functional.elu: _floating(elu),
     torch.nn.functional.linear: _linear,
     **dict.fromkeys((torch.matmul, Tensor.matmul, Tensor.__matmul__), _matmul),
-    **dict.fromkeys((torch.mv, Tensor.mv, torch.mm, Tensor.mm), _matmul),
+    **dict.fromkeys((torch.mv, Tensor.mv), lambda x, y: _of_matrix(x, y, 1)),
+    **dict.fromkeys((torch.mm, Tensor.mm), lambda x, y: _of_matrix(x, y, 2)),
 }
 # Where each of these is told to write into its argument, among what it is given.
 IN_PLACE = {

@@ -144,7 +144,7 @@ def _script(name: str, thing: object = None) -> str:
     """The name by which the script that runs is imported; `name` where there is no file of it.
     thing: defined there; another process may have sent it."""
     main = sys.modules.get("__main__")
-    code = getattr(unwrap(thing) if callable(thing) else thing, "__code__", None)
+    code = unwrap(thing).__code__ if isinstance(thing, FunctionType) else None
     if code is None:  # an object that is called
         own = [vars(c)["__call__"] for c in type(thing).__mro__ if "__call__" in vars(c)]
         code = getattr(own[0], "__code__", None) if own else None
@@ -155,7 +155,8 @@ def _script(name: str, thing: object = None) -> str:
     if not file or Path(file).suffix != ".py":
         return name
     # a notebook names the file of a cell by the text of the cell, which may change
-    return name if Path(file).parent.name.startswith("ipykernel_") else Path(file).stem
+    in_notebook = Path(file).parent.name.startswith("ipykernel_") or "ipython-input" in file
+    return name if in_notebook else Path(file).stem
 
 
 def _is_plain_object(thing: Any) -> bool:

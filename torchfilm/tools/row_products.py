@@ -21,8 +21,8 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     Precisions may differ, as in the four operations: a stiff solver calls in float64 what a module
     holds in float32.
     """
-    common = torch.result_type(x, weight)
     if weight.numel() >= LEAST and _by_kernel(x, weight, bias):
+        common = torch.result_type(x, weight)
         out = _Product.apply(x.to(common), weight.to(common))
     else:
         terms = zip(x.unsqueeze(-1).unbind(-2), weight.unbind(-1), strict=True)
@@ -33,7 +33,8 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 def _by_kernel(*given: Tensor | None) -> bool:
     """Whether the kernel may take it: on the CPU, where nothing follows each operation."""
     values = [x for x in given if x is not None]
-    wrapped = torch._C._functorch.is_functorch_wrapped_tensor
+    torchs = torch._C._functorch
+    wrapped = lambda x: torchs.is_functorch_wrapped_tensor(x) or torchs.is_legacy_batchedtensor(x)
     return (
         all(x.device.type == "cpu" and type(x) in (Tensor, torch.nn.Parameter) for x in values)
         and kernels_loaded(values[0])
@@ -50,7 +51,8 @@ class _Product(torch.autograd.Function):
         from torchfilm.kernels.products import add_product
 
         ctx.save_for_backward(x, weight)
-        rows, columns = as_array(x.reshape(-1, x.shape[-1]), x.dtype), as_array(weight.t(), x.dtype)
+        plain = lambda z: as_array(z.resolve_neg(), x.dtype)
+        rows, columns = plain(x.reshape(-1, x.shape[-1])), plain(weight.t())
         out = torch.zeros(len(rows), len(weight), dtype=x.dtype)
         into = out.numpy()
         _shared(len(rows), lambda first, last: add_product(first, last, rows, columns, into))

@@ -1,0 +1,98 @@
+"""The sums of a series of mixings: their backward pass against torch's graph of every term."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchfilm.signals import series_sums
+from torchfilm.signals.series_sums import sums
+from torchfilm.signals.transport_series import Mixing, poisson
+
+F64 = torch.float64
+SHAPE = (4, 3, 2)
+
+
+def made(colonies=2, one_mixing=False, gain=True, dims=(1, 2, 3)):
+    """Values of a mixing of so many colonies, all of which require gradients, and weights."""
+    draw = torch.Generator().manual_seed(0)
+    rand = lambda b: torch.rand(b, *SHAPE, generator=draw, dtype=F64).requires_grad_()
+    own = 1 if one_mixing else colonies
+    stay, u = rand(own), rand(colonies)
+    sides = [(d, rand(own), rand(1)) for d in dims]  # and one that all colonies share
+    mean = np.linspace(0.4, 1.7, colonies)
+    weights, tails = (torch.as_tensor(x) for x in poisson(mean, 1e-9))
+    return Mixing(stay, tuple(sides)), rand(own) if gain else None, weights, tails, u
+
+
+def leaves(mixing, gain, _weights, _tails, u):
+    each = (u, gain, mixing.stay, *(x for _, *both in mixing.gains for x in both))
+    return [x for x in each if x is not None]
+
+
+def loss(found) -> torch.Tensor:
+    return sum((x * torch.linspace(0.1, 2.0, x.numel(), dtype=F64).view_as(x)).sum() for x in found)
+
+
+FORMS = [{}, {"gain": False}, {"one_mixing": True}, {"colonies": 1}, {"dims": (2,)}, {"dims": ()}]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_gradients_are_those_of_every_term(form):
+    given = made(**form)
+    ours, theirs = sums(*given), series_sums._by_terms(*given)
+    assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
+    assert ours[0].grad_fn is not None and "_Sums" in type(ours[0].grad_fn).__name__
+    own = leaves(*given)
+    found, expected = (torch.autograd.grad(loss(x), own) for x in (ours, theirs))
+    for a, b in zip(found, expected, strict=True):
+        assert a.shape == b.shape and float(a.abs().max()) > 0
+        assert torch.allclose(a, b, rtol=1e-12)
+
+
+def test_one_of_several_requires_a_gradient():
+    for chosen in range(9):
+        given = made()
+        own = leaves(*given)
+        for k, x in enumerate(own):
+            x.requires_grad_(k == chosen)
+        found = torch.autograd.grad(loss(sums(*given)), own[chosen])[0]
+        expected = torch.autograd.grad(loss(series_sums._by_terms(*given)), own[chosen])[0]
+        assert torch.allclose(found, expected, rtol=1e-12)
+    assert len(own) == 9
+    own[chosen].requires_grad_(False)
+    assert not sums(*given)[0].requires_grad
+
+
+def test_the_end_alone_and_the_mean_alone():
+    given = made()
+    own = leaves(*given)
+    for part in (0, 1):
+        found = torch.autograd.grad(loss([sums(*given)[part]]), own)
+        expected = torch.autograd.grad(loss([series_sums._by_terms(*given)[part]]), own)
+        assert all(torch.allclose(a, b, rtol=1e-12) for a, b in zip(found, expected, strict=True))
+
+
+def test_several_backward_passes_and_second_derivatives():
+    given = made()
+    own = leaves(*given)
+    found = sums(*given)
+    first, again = (torch.autograd.grad(loss(found), own, retain_graph=True) for _ in range(2))
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    bent = []
+    for x in (found, series_sums._by_terms(*given)):
+        slopes = torch.autograd.grad(loss(x), own, create_graph=True)
+        bent.append(torch.autograd.grad(sum((s * s).sum() for s in slopes), own))
+    assert all(torch.allclose(a, b, rtol=1e-10) for a, b in zip(*bent, strict=True))
+
+
+def test_many_directions_at_once():
+    """As `jacobian` takes them where it is vectorized."""
+    given = made(colonies=1)
+    (end, _), own = sums(*given), leaves(*given)
+    directions = torch.eye(end.numel(), dtype=F64).view(-1, *end.shape)[:5]
+    many = torch.autograd.grad(end, own, directions, is_grads_batched=True, retain_graph=True)
+    for k, direction in enumerate(directions):
+        one = torch.autograd.grad(end, own, direction, retain_graph=True)
+        assert all(torch.allclose(a[k], b) for a, b in zip(many, one, strict=True))
