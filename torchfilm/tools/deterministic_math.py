@@ -272,12 +272,7 @@ def _sum(x: Tensor, dim: Any = None, keepdim: Any = False, **other: Any) -> Tens
     dim = other.pop("axis", dim)  # NumPy's name of it
     dim = dim[0] if isinstance(dim, (tuple, list)) and len(dim) == 1 else dim
     one_axis = type(dim) is int and type(keepdim) is bool and not other
-    if (
-        not one_axis
-        or x.layout is not torch.strided
-        or x.dim() < 2
-        or not 1 < x.shape[dim] <= MOST_COLUMNS
-    ):
+    if not one_axis or x.dim() < 2 or not 1 < x.shape[dim] <= MOST_COLUMNS:
         return None
     first, *others = x.unbind(dim)
     for column in others:
