@@ -149,3 +149,6 @@ def test_a_gradient_that_founders_lose_is_warned_of():
         cells = tf.Cells(place, [[1.0, 0.0]])
     state = tf.Scene(tf.Growth(rate=1.0), founders=cells, dim=2).bind().start()
     assert state.replace(position=place.double()).position.requires_grad
+    with pytest.warns(UserWarning, match=r"Cells\.length requires a gradient"):
+        cells = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], length=[torch.tensor(3.0, requires_grad=True)])
+    assert cells.length.tolist() == [3.0]

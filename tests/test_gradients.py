@@ -460,3 +460,29 @@ def test_a_rate_laid_without_gradients_carries_none():
         dual = forward_ad.make_dual(rate, torch.ones_like(rate))
         model = tf.Scene(tf.Growth(rate=dual), dim=2, dt=0.05).bind(dtype=F64)
         assert float(tangent(model.step(model.start()).length).sum()) == pytest.approx(float(slope))
+
+
+def tracked(value: float) -> torch.Tensor:
+    return torch.tensor(value, dtype=F64, requires_grad=True)
+
+
+def test_numbers_that_require_gradients_are_described_without_a_warning():
+    """Of torch, which warns where such a number becomes one of Python's, once in a process."""
+    box = {"box": ((-8, -8), (8, 8)), "spacing": 4.0}
+    a = tf.Signal(diffusion=tracked(10.0), decay=tracked(1.0), source=tracked(1.0))
+    food = tf.Signal(diffusion=tracked(10.0), initial=tracked(1.0))
+    inside = tf.Removal(low=(tracked(-torch.inf), -10.0), high=(tracked(10.0), 10.0))
+    scenes = (
+        lambda: tf.Scene(tf.Growth(rate=tracked(1.0)), tf.Medium(a=a, **box), inside, dim=2),
+        lambda: tf.Scene(tf.Growth(), tf.Monod("food"), tf.Medium(food=food, **box), dim=2),
+    )
+    always = torch.is_warn_always_enabled()
+    torch.set_warn_always(True)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", message="Converting a tensor with requires_grad")
+            for scene in scenes:
+                assert "diffusion" in tf.explain(scene())
+                assert scene().bind(dtype=F64).start().cells == 1
+    finally:
+        torch.set_warn_always(always)

@@ -426,7 +426,8 @@ def test_what_mechanics_decided_is_decided_anew_by_others():
     deep = flat.replace(tf.Growth(rate=1.0), tf.Mechanics(dim=3))
     assert (deep.dim, deep.founders.dim) == (3, 3)
     assert flat.replace(tf.Growth(rate=1.0)).dim == 2
-    with pytest.raises(tf.InputError, match="it must be 3-D, as the mechanics are"):
+    in_the_plane = r"3-D, as the mechanics are\. For cells in 2-D write Mechanics\(dim=2\)"
+    with pytest.raises(tf.InputError, match=in_the_plane):
         tf.Scene(
             tf.Mechanics(dim=2), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]])
         ).replace(tf.Mechanics(dim=3))  # fmt: skip

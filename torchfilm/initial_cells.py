@@ -72,11 +72,7 @@ class Cells(metaclass=checks.KnownKeywords):
             raise checks.input_error(f"Cells.axis[{at}]", axis[at].tolist(), rule)
         parts: dict[str, Any] = {"position": position, "axis": axis / size[:, None]}
         for name, above in (("length", False), ("radius", True)):
-            values: np.ndarray = (
-                np.broadcast_to(_array(name, getattr(self, name), np.float64), (count,))
-                if np.ndim(getattr(self, name)) == 0
-                else _column(name, getattr(self, name), count)
-            )
+            values = _column(name, getattr(self, name), count, or_one=True)
             bad = np.flatnonzero(values <= 0 if above else values < 0)
             if bad.size:
                 raise checks.input_error(
@@ -428,9 +424,11 @@ def _array(name: str, given: Any, dtype: type) -> np.ndarray:
     return values
 
 
-def _column(name: str, given: Any, count: int) -> np.ndarray:
-    """An array of shape (count,), or InputError."""
+def _column(name: str, given: Any, count: int, *, or_one: bool = False) -> np.ndarray:
+    """An array of shape (count,), or InputError. or_one: one number is that of all cells."""
     values = _array(name, given, np.float64)
+    if or_one and values.ndim == 0:
+        return np.broadcast_to(values, (count,))
     if values.shape != (count,):
         raise checks.input_error(
             f"Cells.{name}",

@@ -99,6 +99,7 @@ class Scene(metaclass=checks.KnownKeywords):
                 "Scene.founders",
                 f"{made['founders'].dim}-D cells",
                 f"{made['dim']}-D, as the mechanics are",
+                "For cells in {0}-D write Mechanics(dim={0}).".format(made["founders"].dim),
             )
         made["declared_by"] = _check_fields(effects, made["dim"], made["founders"])
         # now, before any run: what a rule refers to may change as it runs
@@ -325,7 +326,10 @@ def _dimension(effects: Sequence[Effect], founders: Cells | None, given: int | N
         checks.choice("Scene.dim", given, (2, 3))
         if stated is not None and stated != given:
             raise checks.input_error(
-                "Scene.dim", given, f"{stated}, as the mechanics are", "Leave it out."
+                "Scene.dim",
+                given,
+                f"{stated}, as the mechanics are",
+                f"Leave it out, or write Mechanics(dim={given}).",
             )
         return given
     if stated is not None:

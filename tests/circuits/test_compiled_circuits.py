@@ -354,7 +354,10 @@ def test_it_is_explained_who_computes():
     with pytest.raises(tf.InputError, match="backend = 'compiled', but branching: it uses a sum"):
         said(tf.Circuit(branching, species="a", backend="compiled"))
     learnt = said(toggle(k=torch.tensor(2.0, requires_grad=True)))
-    assert "computed by compiled functions of its equations, gradients too" in learnt
+    assert (
+        "computed by compiled functions of its equations, gradients by up to 64 numbers too"
+        in learnt
+    )
     equal_steps = said(toggle(method="rk4"))
     assert "computed by compiled functions of its equations; where gradients" in equal_steps
     assert "required by torch, with derivatives from them" in equal_steps

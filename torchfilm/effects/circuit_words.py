@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from torchfilm.circuits.compiled_gradients import MOST_DIRECTIONS
 from torchfilm.parameters import number_range
 from torchfilm.signals.compiled_uptake import EVENTS
 from torchfilm.values import numbers
@@ -37,7 +38,7 @@ def methods_of(
     why = [f"computed by torch: {x}" for x in why_torch]
     gradients = "; where gradients are required by torch, with derivatives from them"
     if circuit.method == "rosenbrock":
-        gradients = ", gradients too"
+        gradients = f", gradients by up to {MOST_DIRECTIONS} numbers too"
     lines += why or [f"computed by compiled functions of its equations{gradients}"]
     if exchanged:
         lines.append(

@@ -330,13 +330,13 @@ class Medium(Effect):
     def _cost_of_turns(self, name: str, dt: float, state: State, often: bool) -> list[str]:
         """What it costs a signal that cells and transport take turns, where that is over 1 %: of
         the colony that it concerns most. A line, or none. often: in each of the medium's steps."""
-        signal = self.signals[name]
+        signal, strang = self.signals[name], self.halves
         if callable(signal.decay) or state.layout is None:
             return []
-        grid, strang = state.layout.grid, self.halves
-        most = torch.broadcast_tensors(*map(torch.as_tensor, (signal.diffusion, signal.decay)))
-        pairs = {(float(k), float(d)) for k, d in zip(*(x.reshape(-1) for x in most), strict=True)}
-        error = lambda turns: min(turns_error(k, d, grid, dt / turns, strang) for k, d in pairs)
+        grid = state.layout.grid
+        given = (torch.as_tensor(x).detach() for x in (signal.diffusion, signal.decay))
+        each = torch.stack(torch.broadcast_tensors(*given), -1).view(-1, 2).unique(dim=0).tolist()
+        error = lambda turns: min(turns_error(k, d, grid, dt / turns, strang) for k, d in each)
         now = enough = self.steps if often else 1
         if error(now) > -0.01:
             return []

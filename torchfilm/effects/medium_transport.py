@@ -201,7 +201,7 @@ class Transport:
     def exchanges_per_hour(self, name: str, state: State) -> float:
         """The greatest rate at which a voxel loses a signal that cells take up, 1/h, but for
         them."""
-        return max(float(x.operator.loss.amax()) for x in self.with_uptake(name, state))
+        return max(float(x.operator.loss.detach().amax()) for x in self.with_uptake(name, state))
 
     def _tracked(self, name: str, state: State) -> bool:
         """Whether derivatives by what a signal's transport depends on are wanted."""

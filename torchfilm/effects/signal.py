@@ -79,7 +79,7 @@ def reach_of(name: str, signal: Signal, spacing: float) -> list[str]:
     if bool((decay <= 0).any() | (diffusion <= 0).any()):
         return []
     reach = (diffusion / decay).sqrt()
-    voxels = float(reach.min()) / spacing
+    voxels = float(reach.detach().min()) / spacing
     few = "" if voxels >= RESOLVED else f": {voxels:.2g} voxels, too few to resolve it"
     return [f"{name} reaches √(K/k) = {number_range(reach)} µm{few}"]
 

@@ -343,8 +343,9 @@ def corners(
         entries: list[float | Tensor] = []
         for k, entry in enumerate(corner):
             single = isinstance(entry, (int, float)) or getattr(entry, "ndim", 1) == 0
-            if single and math.isinf(float(entry)):
-                entries.append(float(entry))
+            bare = entry.detach() if isinstance(entry, Tensor) else entry
+            if single and math.isinf(float(bare)):
+                entries.append(float(bare))
             else:
                 entries.append(
                     value(

@@ -225,6 +225,8 @@ def _rule(count: int) -> str:
 
 def without_gradient(name: str, given: Any) -> Any:
     """What is given for founders, tensors on the CPU; warns where a gradient is lost."""
+    if isinstance(given, list | tuple):
+        return [without_gradient(name, x) for x in given]
     if not isinstance(given, Tensor):
         return given
     if given.requires_grad:
