@@ -13,6 +13,7 @@ from torchfilm.signals.transport import COMPILED, Carrier, carry, prepare
 from torchfilm.signals.transport_rates import build_operator
 from torchfilm.signals.transport_series import MOST
 from torchfilm.tools.checks import InputError
+from torchfilm.tools.tangents import forward_mode, tangent, with_tangent
 
 DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 # 70 voxels make tiles of every width, 130 a panel as well
@@ -208,7 +209,9 @@ def fields(made: tf.Scene) -> torch.Tensor:
 def test_binding_chooses_and_explain_says_it(monkeypatch):
     """backend="torch" forces torch, which then runs: its steps are called, and only its."""
     plain = fields(scene())
-    assert "compiled; by torch where gradients are required" in tf.explain(scene(), seconds=0)
+    assert "compiled; by torch where gradients by its numbers are required" in tf.explain(
+        scene(), seconds=0
+    )
     assert "1), torch; dt·K/h²" not in tf.explain(scene(), seconds=0)
     told = tf.explain(scene(backend="torch"), seconds=0)
     assert "everywhere), torch; dt·K/h²" in " ".join(told.split())
@@ -240,3 +243,55 @@ def test_gradients_go_through_torch():
     values = torch.arange(12, dtype=torch.float64)
     carry(grid_of((4, 3, 1)), [carrier], values)[0].backward()
     assert float(diffusion.grad) > 0
+
+
+@DTYPES
+@pytest.mark.parametrize("faces", BOUNDARIES)
+@pytest.mark.parametrize("method", sorted(COMPILED))
+def test_the_gradient_by_kernels_is_that_of_torch(dtype, faces, method):
+    for shape in ((12, 9, 1), (7, 6, 5), (5, 1, 1)):
+        op, *_ = operator_of(shape, faces, FLOWS[1], dtype=dtype)
+        stepper = prepare(op, 0.7, method)
+        draw = torch.Generator().manual_seed(3)
+        u, weight = (torch.rand(2, *shape, dtype=dtype, generator=draw) for _ in range(2))
+        u.requires_grad_()
+        found = by_kernel(stepper, u)
+        assert torch.equal(found, by_kernel(stepper, u.detach()))
+        assert "_Carried" in type(found.grad_fn.next_functions[0][0]).__name__
+        one, other = (
+            torch.autograd.grad((x.square() * weight).sum(), u, create_graph=True)[0]
+            for x in (found, stepper.step(u))
+        )
+        allowed = 3 * roundings(shape) * torch.finfo(dtype).eps * float(other.detach().max())
+        assert torch.allclose(one, other, rtol=0.0, atol=allowed)
+        again = [torch.autograd.grad(x.square().sum(), u)[0] for x in (one, other)]
+        allowed = 9 * roundings(shape) * torch.finfo(dtype).eps * float(again[1].max())
+        assert torch.allclose(*again, rtol=0.0, atol=allowed)
+
+
+def test_gradients_pass_several_grids_and_a_tangent_beside_goes_by_torch():
+    shapes, weight = ((4, 3, 2), (6, 1, 1)), torch.linspace(0.5, 2.0, 30, dtype=torch.float64)
+    steppers = [prepare(operator_of(x, "mixed", FLOWS[1])[0], 0.7) for x in shapes]
+    grid, draw = grid_of(*shapes), torch.Generator().manual_seed(3)
+    values = torch.rand(30, dtype=torch.float64, generator=draw).requires_grad_()
+    slopes = []
+    for compiled in (True, False):
+        carriers = [Carrier(x, y, compiled) for x, y in zip(steppers, shapes, strict=True)]
+        carried = carry(grid, carriers, values)
+        slopes.append(torch.autograd.grad((carried * weight).sum(), values)[0])
+    assert torch.allclose(*slopes, rtol=1e-12) and float(slopes[0].min()) > 0
+    carriers = [Carrier(x, y) for x, y in zip(steppers, shapes, strict=True)]
+    with forward_mode():
+        carried = carry(grid, carriers, with_tangent(values, torch.ones_like(values)))
+        back = torch.autograd.grad((carried * weight).sum(), values)[0]
+        assert torch.allclose(back, slopes[1], rtol=1e-12)
+        assert float(tangent(carried).detach().min()) > 0
+
+
+def test_gradients_through_steps_that_are_solved_go_through_torch():
+    op, *_ = operator_of((6, 5, 1), "mixed", FLOWS[1])
+    stepper = prepare(op, 40 * MOST, "series")
+    u = torch.rand(1, 6, 5, 1, dtype=torch.float64).requires_grad_()
+    slopes = [torch.autograd.grad(f(u).square().sum(), u)[0] for f in (
+        lambda u: by_kernel(stepper, u), stepper.step)]  # fmt: skip
+    assert torch.allclose(*slopes, rtol=1e-12) and float(slopes[0].abs().max()) > 0

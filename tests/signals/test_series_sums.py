@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from torchfilm.signals import series_sums
+from torchfilm.signals.mixing import Mixing
 from torchfilm.signals.series_sums import sums
-from torchfilm.signals.transport_series import Mixing, poisson
+from torchfilm.signals.transport_series import poisson
 
 F64 = torch.float64
 SHAPE = (4, 3, 2)
@@ -23,10 +24,10 @@ def made(colonies=2, one_mixing=False, gain=True, dims=(1, 2, 3)):
     sides = [(d, rand(own), rand(1)) for d in dims]  # and one that all colonies share
     mean = np.linspace(0.4, 1.7, colonies)
     weights, tails = (torch.as_tensor(x) for x in poisson(mean, 1e-9))
-    return Mixing(stay, tuple(sides)), rand(own) if gain else None, weights, tails, u
+    return Mixing(stay, tuple(sides)), rand(own) if gain else None, (weights, tails), u
 
 
-def leaves(mixing, gain, _weights, _tails, u):
+def leaves(mixing, gain, _rows, u):
     each = (u, gain, mixing.stay, *(x for _, *both in mixing.gains for x in both))
     return [x for x in each if x is not None]
 
@@ -38,8 +39,10 @@ def loss(found) -> torch.Tensor:
 FORMS = [{}, {"gain": False}, {"one_mixing": True}, {"colonies": 1}, {"dims": (2,)}, {"dims": ()}]
 
 
+@pytest.mark.parametrize("kept", [series_sums.KEPT, 0])
 @pytest.mark.parametrize("form", FORMS)
-def test_gradients_are_those_of_every_term(form):
+def test_gradients_are_those_of_every_term(form, kept, monkeypatch):
+    monkeypatch.setattr(series_sums, "KEPT", kept)
     given = made(**form)
     ours, theirs = sums(*given), series_sums._by_terms(*given)
     assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
@@ -85,6 +88,30 @@ def test_several_backward_passes_and_second_derivatives():
         slopes = torch.autograd.grad(loss(x), own, create_graph=True)
         bent.append(torch.autograd.grad(sum((s * s).sum() for s in slopes), own))
     assert all(torch.allclose(a, b, rtol=1e-10) for a, b in zip(*bent, strict=True))
+
+
+def test_terms_backwards():
+    mixing, gain, _, u = made()
+    for kept in (0, series_sums.KEPT):
+        for count in (1, 2, 3, 4, 5, 9, 10, 11, 37):
+            with pytest.MonkeyPatch.context() as patch, torch.no_grad():
+                patch.setattr(series_sums, "KEPT", kept)
+                found = list(series_sums._backwards(mixing, gain, u, count))
+                expected = [u]
+                while len(expected) < count:
+                    expected.append(mixing.of(expected[-1]) + gain)
+            assert len(found) == count
+            assert all(torch.equal(a, b) for a, b in zip(found[::-1], expected, strict=True))
+
+
+def test_the_transposed_mixing():
+    for dims in ((1, 2, 3), (2,), ()):
+        mixing = made(dims=dims)[0]
+        a, b = torch.rand(2, 2, *SHAPE, dtype=F64)
+        one, other = (a * mixing.of(b)).sum(), (mixing.transposed().of(a) * b).sum()
+        assert torch.allclose(one, other, rtol=1e-13)
+        back = mixing.transposed().transposed()
+        assert torch.equal(back.of(a), mixing.of(a))
 
 
 def test_many_directions_at_once():

@@ -321,7 +321,7 @@ class Medium(Effect):
                 )
             ratio = number_range(torch.as_tensor(signal.diffusion) * (dt / finest**2))
             who = self.backend_on(state.device) if method in COMPILED else "torch"
-            who = "compiled; by torch where gradients are required" if who == "compiled" else who
+            who += "; by torch where gradients by its numbers are required" * (who == "compiled")
             lines.append(f"{name}: {method}, {order} ({why}), {who}; dt·K/h² = {ratio}")
             if found is None or name in found:
                 lines += self._cost_of_turns(name, dt, state, name in exchanged)

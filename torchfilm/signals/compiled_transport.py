@@ -1,4 +1,4 @@
-"""Transport by compiled kernels, on the CPU where no gradient is wanted."""
+"""Transport by compiled kernels, on the CPU where no gradient by its coefficients is wanted."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from torch import Tensor
 
 from torchfilm.signals.compiled import may_run
 from torchfilm.signals.grid import Shape
+from torchfilm.signals.mixing import Mixing
 from torchfilm.signals.transport_exponential import Exponential
 from torchfilm.signals.transport_iterative import MAX_ITERATIONS, ROUNDING, TOLERANCE
-from torchfilm.signals.transport_series import Mixing, Series
+from torchfilm.signals.transport_series import Series
 from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.threads import Shared
 
@@ -22,6 +23,7 @@ from torchfilm.tools.threads import Shared
 class CompiledExponential:
     """`Exponential` for one shape of grid, in arrays as `kernels.transport.carry` takes them."""
 
+    stepper: Exponential
     shape: Shape
     axes: np.ndarray
     factors: tuple[np.ndarray, ...]
@@ -36,6 +38,12 @@ class CompiledExponential:
     def linear(self) -> CompiledExponential:
         """The step without what sources and boundaries add."""
         return replace(self, gained=np.empty((0, 0), self.gained.dtype))
+
+    @cached_property
+    def adjoint(self) -> CompiledExponential | None:
+        """What takes gradients of the step's result to those of what it began with."""
+        turned = tuple(None if x is None else x.transpose(1, 2) for x in self.stepper.factors)
+        return compiled_exponential(Exponential(turned, None), self.shape)
 
     def step(self, values: Tensor, starts: np.ndarray, out: Tensor) -> None:
         """Put the grids that begin at `starts` of values (voxels,) into out, one step later."""
@@ -74,7 +82,7 @@ def compiled_exponential(stepper: Exponential, shape: Shape) -> CompiledExponent
     axes = np.array([k for k, f in enumerate(stepper.factors) if f is not None], np.int64)
     gained = torch.empty(0, 0, dtype=dtype) if stepper.gained is None else stepper.gained
     return CompiledExponential(
-        shape, axes, tuple(factors), tuple(firsts), tuple(lasts),
+        stepper, shape, axes, tuple(factors), tuple(firsts), tuple(lasts),
         as_array(gained.flatten(1), dtype),
     )  # fmt: skip
 
@@ -106,6 +114,15 @@ class CompiledSeries:
             return None
         *mixing, gained = self.arrays
         return replace(self, arrays=(*mixing, np.empty((0, gained.shape[1]), gained.dtype)))
+
+    @cached_property
+    def adjoint(self) -> CompiledSeries | None:
+        """What takes gradients of the step's result to those of what it began with; None where
+        another method takes the long steps."""
+        if self.stepper.far is not None:
+            return None
+        turned = replace(self.stepper, mixing=self.stepper.mixing.transposed(), gained=None)
+        return compiled_series(turned, self.shape)
 
     def step(self, values: Tensor, starts: np.ndarray, out: Tensor) -> None:
         """Put the grids that begin at `starts` of values (voxels,) into out, one step later."""

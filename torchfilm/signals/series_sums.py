@@ -1,96 +1,125 @@
 """Sums of a series of mixings, and their backward pass: the same series, run backwards.
 
-With x_0 = u and x_(k+1) = P x_k + g these are Σ_k w_k x_k and Σ_k t_k x_k, for two rows of weights.
-Their derivatives come from one more series, of Pᵀ. Torch's own graph holds every operation of the
-series, a few hundred, and a solve for derivatives goes through it several times.
+With x_0 = u and x_(k+1) = P x_k + g these are Σ_k w_k x_k, for each row of weights w. Their
+derivatives come from one more series, of Pᵀ. Torch's own graph would hold every operation of the
+series, some thousands, and a solve for derivatives goes through it several times.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
+from functools import reduce
+
 import torch
 from torch import Tensor
 
-from torchfilm.signals.transport_series import Mixing
+from torchfilm.signals.mixing import Mixing
 from torchfilm.tools.tangents import in_forward_mode
+
+# Numbers of all terms up to which a backward pass keeps them, for others that may follow. A longer
+# series is gone through once more in a backward pass, and as many as the root of its terms held.
+KEPT = 2**20
 
 
 def sums(
-    mixing: Mixing, gain: Tensor | None, weights: Tensor, tails: Tensor, u: Tensor
-) -> tuple[Tensor, Tensor]:
-    """The two sums, (b, nx, ny, nz) each. u: of that shape; gain: g, or None; weights, tails:
-    (terms, b), constants."""
+    mixing: Mixing, gain: Tensor | None, rows: Sequence[Tensor], u: Tensor
+) -> tuple[Tensor, ...]:
+    """The sum of each row, (b, nx, ny, nz). u: of that shape; gain: g, or None; rows: (terms, b or
+    1) each, constants."""
     sides = [x for _, *both in mixing.gains for x in both]
     values = [x for x in (u, gain, mixing.stay, *sides) if x is not None]
     if in_forward_mode() or not torch.is_grad_enabled() or not any(x.requires_grad for x in values):
-        return _by_terms(mixing, gain, weights, tails, u)
+        return _by_terms(mixing, gain, rows, u)
     dims = tuple(dim for dim, _, _ in mixing.gains)
-    return _Sums.apply(dims, weights, tails, u, gain, mixing.stay, *sides)
+    return _Sums.apply(dims, torch.stack(tuple(rows)), u, gain, mixing.stay, *sides)
 
 
 def _by_terms(
-    mixing: Mixing, gain: Tensor | None, weights: Tensor, tails: Tensor, u: Tensor
-) -> tuple[Tensor, Tensor]:
-    size = (-1, 1, 1, 1)
-    end, total = weights[0].reshape(size) * u, tails[0].reshape(size) * u
-    for weight, tail in zip(weights[1:], tails[1:], strict=True):
+    mixing: Mixing, gain: Tensor | None, rows: Sequence[Tensor] | Tensor, u: Tensor
+) -> tuple[Tensor, ...]:
+    found = [_weighted(row[0], u) for row in rows]
+    for k in range(1, len(rows[0])):
         u = _next(mixing, gain, u)
-        end, total = end + weight.reshape(size) * u, total + tail.reshape(size) * u
-    return end, total
+        found = [x + _weighted(row[k], u) for x, row in zip(found, rows, strict=True)]
+    return tuple(found)
+
+
+def _weighted(weight: Tensor, value: Tensor) -> Tensor:
+    return weight.reshape(-1, 1, 1, 1) * value
 
 
 def _next(mixing: Mixing, gain: Tensor | None, u: Tensor) -> Tensor:
     return mixing.of(u) if gain is None else mixing.of(u) + gain
 
 
+def _backwards(mixing: Mixing, gain: Tensor | None, u: Tensor, count: int) -> Iterator[Tensor]:
+    """x_(count − 1), …, x_1, x_0."""
+    size = count if count * u.numel() <= KEPT else math.isqrt(count) + 1
+    firsts, last = [u], u
+    for k in range(1, (count - 1) // size * size + 1):
+        last = _next(mixing, gain, last)
+        if k % size == 0:
+            firsts.append(last)
+    while firsts:
+        terms = [firsts.pop()]
+        for _ in range(min(size, count - len(firsts) * size) - 1):
+            terms.append(_next(mixing, gain, terms[-1]))
+        yield from reversed(terms)
+
+
 class _Sums(torch.autograd.Function):
-    """As `sums`, where gradients are wanted. sides: of each dimension, what a voxel gets from the
-    one below, and from the one above."""
+    """As `sums`, where gradients are wanted. rows: (sums, terms, b or 1). sides: of each dimension,
+    what a voxel gets from the one below, and from the one above."""
 
     @staticmethod
-    def forward(ctx, dims, weights, tails, u: Tensor, gain: Tensor | None, stay, *sides):
+    def forward(ctx, dims, rows: Tensor, u: Tensor, gain: Tensor | None, stay, *sides):
         mixing = _mixing(dims, stay, sides)
         ctx.dims, ctx.terms = dims, None
-        ctx.save_for_backward(weights, tails, u, gain, stay, *sides)
-        return _by_terms(mixing, gain, weights, tails, u)
+        ctx.save_for_backward(rows, u, gain, stay, *sides)
+        return _by_terms(mixing, gain, rows, u)
 
     @staticmethod
-    def backward(ctx, of_end: Tensor, of_total: Tensor):  # type: ignore[override]
-        weights, tails, u, gain, stay, *sides = ctx.saved_tensors
-        mixing, size = _mixing(ctx.dims, stay, sides), (-1, 1, 1, 1)
-        tracked = torch.is_grad_enabled()  # for second derivatives
-        terms = None if tracked else ctx.terms
-        if terms is None:
-            terms = [u]
-            for _ in range(len(weights) - 2):
-                terms.append(_next(mixing, gain, terms[-1]))
-            ctx.terms = None if tracked else terms  # several backward passes may follow
-        wanted = ctx.needs_input_grad[4:]
+    def backward(ctx, *of_sums: Tensor):  # type: ignore[override]
+        rows, u, gain, stay, *sides = ctx.saved_tensors
+        mixing, last = _mixing(ctx.dims, stay, sides), rows.shape[1] - 1
+        wanted = ctx.needs_input_grad[3:]
         found: list[Tensor | None] = [None] * len(wanted)
 
         def add(k: int, value: Tensor) -> None:
             before = found[k]
             found[k] = value if before is None else before + value
 
-        pull = lambda k: weights[k].reshape(size) * of_end + tails[k].reshape(size) * of_total
-        back = pull(len(weights) - 1)
-        for k in range(len(weights) - 2, -1, -1):
+        pull = lambda k: reduce(torch.add, map(_weighted, rows[:, k], of_sums))
+        back, pulled = pull(last), mixing.transposed()
+        terms = _terms(ctx, mixing, gain, u, last) if last and any(wanted[1:]) else None
+        for k in range(last - 1, -1, -1):
             if wanted[0]:
                 add(0, back)
-            if wanted[1]:
-                add(1, back * terms[k])
-            for n, dim in enumerate(ctx.dims):
-                for side, shift in ((2 * n, 1), (2 * n + 1, -1)):
-                    if wanted[2 + side]:
-                        add(2 + side, back * torch.roll(terms[k], shift, dim))
-            back = mixing.pulled(back) + pull(k)
-        given = (gain, stay, *sides)
+            if terms is not None:
+                term = next(terms)
+                if wanted[1]:
+                    add(1, back * term)
+                for n, dim in enumerate(ctx.dims):
+                    for side, shift in ((2 * n, 1), (2 * n + 1, -1)):
+                        if wanted[2 + side]:
+                            add(2 + side, back * torch.roll(term, shift, dim))
+            back = pulled.of(back) + pull(k)
         own = [
             None if x is None or value is None else value.sum_to_size(x.shape)
-            for x, value in zip(given, found, strict=True)
+            for x, value in zip((gain, stay, *sides), found, strict=True)
         ]
-        return None, None, None, back.sum_to_size(u.shape), *own
+        return None, None, back.sum_to_size(u.shape), *own
 
 
-def _mixing(dims: tuple[int, ...], stay: Tensor, sides: object) -> Mixing:
-    each = list(sides)  # type: ignore[call-overload]
-    return Mixing(stay, tuple(zip(dims, each[::2], each[1::2], strict=True)))
+def _terms(ctx, mixing: Mixing, gain: Tensor | None, u: Tensor, count: int) -> Iterator[Tensor]:
+    """As `_backwards`; kept where they are few, as several backward passes may follow."""
+    if torch.is_grad_enabled() or count * u.numel() > KEPT:  # on: for second derivatives
+        return _backwards(mixing, gain, u, count)
+    if ctx.terms is None:
+        ctx.terms = list(_backwards(mixing, gain, u, count))
+    return iter(ctx.terms)
+
+
+def _mixing(dims: tuple[int, ...], stay: Tensor, sides: Sequence[Tensor]) -> Mixing:
+    return Mixing(stay, tuple(zip(dims, sides[::2], sides[1::2], strict=True)))

@@ -40,7 +40,7 @@ from torchfilm.signals.transport_iterative import prepare_crank_nicolson, prepar
 from torchfilm.signals.transport_operator import Operator
 from torchfilm.signals.transport_series import Series, prepare_series
 from torchfilm.tools import checks, subnormals
-from torchfilm.tools.tangents import both, with_tangent
+from torchfilm.tools.tangents import both, has_tangent, with_tangent
 
 
 class Stepper(Protocol):
@@ -116,10 +116,30 @@ def carry(grid: Grid, carriers: Sequence[Carrier], values: Tensor) -> Tensor:
         linear = [carrier.linear for carrier in carriers]
         if moved is not None and None not in linear:
             return with_tangent(_run(grid, kernels, value), _run(grid, linear, moved))
-    if None in kernels or not may_run(values):
-        pairs = zip(carriers, grid.batches, strict=True)
-        return grid.join([carrier.stepper.step(batch.of(values)) for carrier, batch in pairs])
-    return _run(grid, kernels, values)
+    if None not in kernels and may_run(values):
+        return _run(grid, kernels, values)
+    if None not in kernels and not has_tangent(values):
+        adjoints = [kernel.adjoint for kernel in kernels if kernel is not None]
+        if None not in adjoints:
+            return _Carried.apply(values, grid, kernels, adjoints)
+    pairs = zip(carriers, grid.batches, strict=True)
+    return grid.join([carrier.stepper.step(batch.of(values)) for carrier, batch in pairs])
+
+
+class _Carried(torch.autograd.Function):
+    """A step by kernels, with the gradient by what it began with: that of an affine step is a step
+    of the transposed operator."""
+
+    @staticmethod
+    def forward(ctx, values: Tensor, grid: Grid, kernels, adjoints) -> Tensor:
+        ctx.given = grid, adjoints, kernels
+        return _run(grid, kernels, values)
+
+    @staticmethod
+    def backward(ctx, back: Tensor):  # type: ignore[override]
+        grid, adjoints, kernels = ctx.given
+        linear = [kernel.linear() for kernel in kernels]
+        return _Carried.apply(back, grid, adjoints, linear), None, None, None
 
 
 def _run(grid: Grid, kernels: Sequence[Kernel | None], values: Tensor) -> Tensor:

@@ -20,6 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.signals.mixing import Mixing, mixing_of
+from torchfilm.signals.series_sums import sums
 from torchfilm.signals.transport_iterative import Unsplit, prepare_backward_euler
 from torchfilm.signals.transport_operator import Operator
 
@@ -31,33 +33,6 @@ FARTHEST = 1e12
 ABOVE = 1.01
 # Weights below this part of the precision of the values are left out.
 CUT = 1 / 64
-
-
-@dataclass(frozen=True, eq=False)
-class Mixing:
-    """P = I + T/λ in float64, without its gain: stay (B or 1, nx, ny, nz), the part of its content
-    that a voxel keeps; gains: for each axis with neighbours (dimension, from the voxel below, from
-    the voxel above). A voxel at a face gets from the opposite one, with a part of 0 unless the axis
-    is periodic."""
-
-    stay: Tensor
-    gains: tuple[tuple[int, Tensor, Tensor], ...]
-
-    def of(self, v: Tensor) -> Tensor:
-        """P v, for v (B, nx, ny, nz)."""
-        out = self.stay * v
-        for dim, up, down in self.gains:
-            out = out + up * torch.roll(v, 1, dim)
-            out = out + down * torch.roll(v, -1, dim)
-        return out
-
-    def pulled(self, v: Tensor) -> Tensor:
-        """Pᵀ v, for v (B, nx, ny, nz)."""
-        out = self.stay * v
-        for dim, up, down in self.gains:
-            out = out + torch.roll(up * v, -1, dim)
-            out = out + torch.roll(down * v, 1, dim)
-        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +53,7 @@ class Series:
 
     def step(self, u: Tensor) -> Tensor:
         """u (B, nx, ny, nz) one step later."""
-        out = _mean(self.mixing, self.weights, u.double())
+        (out,) = sums(self.mixing, None, [self.weights], u.double())
         out = (out if self.gained is None else out + self.gained).to(u.dtype)
         if self.far is None or self.solved is None:
             return out
@@ -105,7 +80,7 @@ def prepare_series(operator: Operator, dt: float) -> Series:
     if operator.gain is not None:
         each = on_device(tails) / rate
         whole = operator.gain.expand(max(rate.numel(), operator.gain.shape[0]), *operator.shape)
-        gained = _mean(mixing, each, whole)
+        (gained,) = sums(mixing, None, [each], whole)
     any_far = bool(far.any())
     return Series(
         mixing,
@@ -115,32 +90,6 @@ def prepare_series(operator: Operator, dt: float) -> Series:
         on_device(far) if any_far else None,
         prepare_backward_euler(operator, dt) if any_far else None,
     )
-
-
-def _mean(mixing: Mixing, weights: Tensor, v: Tensor) -> Tensor:
-    """Σ_k weights_k P^k v; weights (terms, B or 1)."""
-    out = weights[0].reshape(-1, 1, 1, 1) * v
-    for weight in weights[1:]:
-        v = mixing.of(v)
-        out = out + weight.reshape(-1, 1, 1, 1) * v
-    return out
-
-
-def mixing_of(operator: Operator, rate: Tensor) -> Mixing:
-    """P of an operator; rate: λ, (B or 1, 1, 1, 1)."""
-    gains = []
-    for axis in operator.axes:
-        if axis.size == 1:
-            continue
-        n, dim = axis.size, axis.dim
-        up, down = axis.up.narrow(dim, 0, n) / rate, axis.down.narrow(dim, 1, n) / rate
-        if not axis.periodic:
-            inner = torch.ones(n, dtype=up.dtype, device=up.device)
-            inner[0] = 0.0
-            shape = [n if k == dim else 1 for k in range(4)]
-            up, down = up * inner.reshape(shape), down * inner.flip(0).reshape(shape)
-        gains.append((dim, up, down))
-    return Mixing(1 - operator.loss / rate, tuple(gains))
 
 
 def poisson(mean: np.ndarray, cut: float) -> tuple[np.ndarray, np.ndarray]:

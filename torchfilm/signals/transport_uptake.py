@@ -24,10 +24,11 @@ from torch import Tensor
 
 from torchfilm.signals.compiled_uptake import EVENTS, CompiledUptake, compiled_uptake
 from torchfilm.signals.grid import Shape
+from torchfilm.signals.mixing import mixing_of
 from torchfilm.signals.series_sums import sums
 from torchfilm.signals.transport_iterative import prepare_backward_euler
 from torchfilm.signals.transport_operator import Operator
-from torchfilm.signals.transport_series import ABOVE, CUT, mixing_of, poisson
+from torchfilm.signals.transport_series import ABOVE, CUT, poisson
 from torchfilm.tools.tangents import both
 
 
@@ -88,5 +89,5 @@ def _series(operator: Operator, rate: Tensor, dt: float, u: Tensor) -> tuple[Ten
     weights, tails = both_weights
     mixing = mixing_of(operator, rate.reshape(size))
     gain = None if operator.gain is None else operator.gain / rate.reshape(size)
-    end, total = sums(mixing, gain, weights, tails, u)
+    end, total = sums(mixing, gain, (weights, tails), u)
     return end, total / torch.where(events > 0, events, 1.0).reshape(size)
