@@ -16,12 +16,12 @@ FORMAT = "torchfilm weights 1"
 @checks.known_keywords
 def save_weights(module: torch.nn.Module, path: str | Path) -> Path:
     """Write the parameters and buffers of a module, each with name, dtype and shape. Replaces an
-    older file. Raises InputError where a number is not finite, or a tensor holds no reals."""
+    older file. Raises InputError where a number is not finite, or a tensor is complex."""
     path, stored = checks.file_path("path", path), {}
     _check_module(module)
     for name, value in module.state_dict().items():
-        if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
-            raise checks.input_error(f"weights[{name!r}]", value.dtype, "finite floating numbers")
+        if value.is_complex() or not bool(torch.isfinite(value).all()):
+            raise checks.input_error(f"weights[{name!r}]", value.dtype, "finite real numbers")
         flat = value.detach().cpu().double().flatten().tolist()
         kind = str(value.dtype).removeprefix("torch.")
         stored[name] = {"dtype": kind, "shape": list(value.shape), "values": flat}

@@ -370,3 +370,39 @@ def test_rollout_follows_a_replay_with_its_gradient(segment):
 def test_cells_of_a_recording_are_a_whole_number(cells):
     with pytest.raises(tf.InputError, match=r"^cells = "):
         tf.GrowthRecording(DESIGNS["amounts shared"](1.0), streams=(0,), cells=cells)
+
+
+@dataclass(frozen=True, eq=False)
+class Controlled(tf.Effect):
+    """Growth rates by a network."""
+
+    net: torch.nn.Module
+    stage, title = 15, "controlled"
+
+    def reads(self):
+        return ["length"]
+
+    def writes(self):
+        return ["growth_rate"]
+
+    def step(self, state, dt, values):
+        rate = torch.nn.functional.softplus(self.net(state.length[:, None])[:, 0])
+        return state.with_fields(growth_rate=rate)
+
+
+def test_growth_by_a_network_counts_with_its_weights():
+    torch.manual_seed(0)
+    nets = [torch.nn.Linear(1, 1).requires_grad_(False) for _ in range(2)]
+    made = lambda net: lit().replace(Controlled(net), tf.Growth(), *lit().effects[1:])
+    one, two = map(made, nets)
+    assert one == made(nets[0]) and one != two
+    recording = tf.GrowthRecording(one, streams=[0])
+    assert tf.rollout(tf.Replay(one.bind(), recording), until=0.5).cells > 0
+    with pytest.raises(tf.InputError, match="does not grow as the recording did"):
+        tf.Replay(two.bind(), recording)
+    nets[0].weight += 1.0
+    with pytest.raises(tf.InputError, match="does not grow as the recording did"):
+        tf.Replay(one.bind(), recording)
+    nets[1].requires_grad_(True)
+    with pytest.raises(tf.InputError, match=r"weights of a network of controlled.*requires_grad_"):
+        tf.GrowthRecording(two, streams=[0])

@@ -318,3 +318,42 @@ def test_a_ready_scene_with_other_effects_has_no_recipe(tmp_path):
     slower = base.replace(tf.Growth(rate=0.5), *base.effects[1:])
     assert base.recipe[1]["rate"] == 1.0 and slower.recipe is None
     assert base.replace(dt=0.01).recipe == base.recipe
+
+
+def controlled(net) -> tf.Scene:
+    circuit = tf.Circuit(
+        lambda u, s, p, cell: {"a": net(u.a[:, None])[:, 0] - u.a}, species="a", method="heun2"
+    )
+    return tf.Scene(tf.Growth(rate=1.0), circuit, dim=2, dt=DT)
+
+
+def weighed(value: float) -> torch.nn.Module:
+    net = torch.nn.Sequential(torch.nn.Linear(1, 1), torch.nn.Softplus())
+    with torch.no_grad():
+        for x in net.parameters():
+            x.fill_(value)
+    return net
+
+
+def test_other_weights_are_another_scene_and_training_is_no_edit(tmp_path):
+    """The weights that count are those of the run, not those when the scene was made."""
+    path, net = tmp_path / "run.h5", weighed(0.1)
+    scene = controlled(net)
+    with torch.no_grad():
+        net[0].weight.fill_(0.5)
+    last = record(scene, scene.bind(2).start(), path, until=2 * DT)[-1]
+    same = weighed(0.1)
+    same.load_state_dict(net.state_dict())
+    with tf.Results(path) as results:
+        assert results.state(controlled(same)).step == results.state(scene).step == 2
+        with pytest.raises(tf.InputError, match=r"the weights of a network that its effects use"):
+            results.state(controlled(weighed(0.1)))
+        assert results.state(controlled(weighed(0.1)), changed=True).step == 2
+    with torch.no_grad():
+        net[0].weight.fill_(0.6)
+    with pytest.raises(tf.InputError, match="the weights of a network that its effects use"):
+        record(scene, last, path, until=4 * DT, append=True)
+    with h5py.File(path, "r+") as file:  # as an earlier version wrote it
+        file.attrs["code"] = json.dumps(json.loads(file.attrs["code"])[:3])
+    with tf.Results(path) as results:
+        assert results.state(scene).step == 2

@@ -16,6 +16,7 @@ from torchfilm.resolver import FirstValue
 from torchfilm.rule_views import KNOWN_FIELDS, MEANS
 from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
+from torchfilm.tools.hashing import networks
 from torchfilm.tools.tangents import tracked
 from torchfilm.tools.warn_once import warn
 
@@ -262,6 +263,12 @@ def why_not_replayable(model: Model) -> str:
             return f"{path} differs between colonies and acts on their growth"
         if tracked(tensor):
             return f"a derivative by {path} is wanted, which recorded growth does not carry"
+    for effect in (model.scene.effects[k] for k in model.recorded):
+        if tracked(*(w for net in networks(effect) for w in net.parameters())):
+            return (
+                f"a derivative by the weights of a network of {effect.title} is wanted, which"
+                " recorded growth does not carry: net.requires_grad_(False) if it is not"
+            )
     return ""
 
 

@@ -60,8 +60,8 @@ class Model:
         stage = DIVISION if late else FLAGGED_DIVISION
         binding = Binding(batch, scene.dt, scene.dim, scene.declared_by, stage)
         bound: list[BoundEffect] = []
-        # a model that was bound under torch.no_grad() may be stepped with gradients
-        with torch.enable_grad():
+        # a model that was bound without gradients may be stepped with them
+        with torch.inference_mode(False), torch.enable_grad():
             for place, effect in enumerate(scene.effects):
                 if only is not None and place not in only:
                     continue
@@ -86,7 +86,8 @@ class Model:
         state = self._laid(begin)
         for effect in self.effects:
             state = effect.ready(state)
-        return state
+        # apart from the model's own numbers, so that an edit in place changes no other start
+        return state.replace(fields={n: x.clone() for n, x in state.fields.items()})
 
     def step(self, state: State, dt: float | None = None, timings: Timings | None = None) -> State:
         """The state dt hours later (by default the scene's step): each effect in turn."""

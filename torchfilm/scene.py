@@ -23,7 +23,7 @@ from torchfilm.physics.surfaces import Surface
 from torchfilm.rule_views import OF_EFFECTS
 from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks, displays
-from torchfilm.tools.hashing import digest, without_addresses
+from torchfilm.tools.hashing import digest, digest_of_code, digest_of_weights, without_addresses
 from torchfilm.tools.listings import differences
 from torchfilm.tools.warn_once import once, warn
 from torchfilm.version import __version__
@@ -57,7 +57,7 @@ class Scene(metaclass=checks.KnownKeywords):
     recipe: tuple[str, dict[str, Any]] | None
     settings: dict[str, Any]
     accuracy: dict[str, float]
-    code: list[str]
+    _code: tuple[str, str, str]
     declared_by: dict[str, str]
     _given: dict[str, Any]  # founders and dim, None where other things decided
     _said: frozenset[str]  # warnings given when it was made
@@ -103,11 +103,8 @@ class Scene(metaclass=checks.KnownKeywords):
             )
         made["declared_by"] = _check_fields(effects, made["dim"], made["founders"])
         # now, before any run: what a rule refers to may change as it runs
-        made["code"] = [
-            f"{sys.version_info[0]}.{sys.version_info[1]}",
-            __version__,
-            digest(effects),
-        ]
+        version = f"{sys.version_info[0]}.{sys.version_info[1]}"
+        made["_code"] = version, __version__, digest_of_code(effects)
         self.__dict__.update(made)
         with once() as said:
             for effect in effects:
@@ -130,6 +127,12 @@ class Scene(metaclass=checks.KnownKeywords):
     def fingerprint(self) -> str:
         """A hexadecimal word, equal for scenes that simulate the same."""
         return digest(self.effects, self.drawn_from, self.dim, self.dt, self.name)
+
+    @property
+    def code(self) -> list[str]:
+        """The versions of Python and torchfilm, a word for the code of functions as the scene was
+        made, and one for the weights of networks as they are now, "" where there are none."""
+        return [*self._code, digest_of_weights(self.effects)]
 
     @property
     def drawn_from(self) -> Any:
@@ -216,12 +219,16 @@ class Scene(metaclass=checks.KnownKeywords):
         now = self.listing()
         if effects is not None and effects != now:
             return differences(effects, now) or "the same effects in another order"
-        if code is not None and code[:2] == self.code[:2] and code != self.code:
+        own = self.code
+        if code is None or code[:2] != own[:2]:
+            return ""
+        if code[2] != own[2]:
             return (
                 "a function of its effects was edited, or an object that such a function uses, or a"
                 " parameter with one value per colony"
             )
-        return ""
+        others = code[3:] not in ([], own[3:])  # files of earlier versions lack it
+        return "the weights of a network that its effects use are others" if others else ""
 
     def warn_if_not(self, path: object, design: Mapping[str, Any]) -> None:
         """Warn where this is another scene than that of a saved design, the content of a file."""

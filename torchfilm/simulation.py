@@ -27,7 +27,9 @@ from torchfilm.replay import Replay
 from torchfilm.scene import Scene
 from torchfilm.state import State
 from torchfilm.tools import checks, displays
+from torchfilm.tools.hashing import trained
 from torchfilm.tools.progress import RunBar, wanted
+from torchfilm.tools.segments import Segment
 from torchfilm.tools.threads import after_fork
 from torchfilm.tools.timing import Timings
 
@@ -232,7 +234,7 @@ def rollout(
     model.check_step(dt)
     monitors = [partial(handle_failures, on_failure="raise")]
 
-    def segment_of(begin: State, steps: int) -> State:
+    def steps_from(begin: State, steps: int) -> State:
         last_step, end = begin.step + steps, begin
         stop = lambda s: s.step >= last_step
         for later in advance(step, begin, stop=stop, monitors=monitors):
@@ -240,9 +242,23 @@ def rollout(
         return end
 
     if segment is None or not torch.is_grad_enabled():
-        return segment_of(state, last - state.step)
+        return steps_from(state, last - state.step)
+    weights = trained(model.scene.effects)
+    versions = [w._version for w in weights]
+
+    def segment_of(kept: Segment, begin: State, steps: int) -> State:
+        with kept.steps() as again:
+            if again and versions != [w._version for w in weights]:
+                raise checks.InputError(
+                    "a tensor that the scene uses, such as a weight of a network, changed between"
+                    " rollout and the gradient, which does its steps again: call backward before"
+                    " the step of an optimiser, or give rollout segment=None."
+                )
+            return steps_from(begin, steps)
+
     while state.step < last:
-        state = checkpoint(segment_of, state, min(segment, last - state.step), use_reentrant=False)
+        count = min(segment, last - state.step)
+        state = checkpoint(segment_of, Segment(), state, count, use_reentrant=False)
     return state
 
 

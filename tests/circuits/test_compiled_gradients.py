@@ -206,3 +206,84 @@ def test_a_cell_that_fails_leaves_the_gradients_of_others(plain, backend):
     good = state.select([0])
     found = torch.autograd.grad((good.a * good.volume).sum(), [k, first])
     assert all(bool(x.isfinite()) and float(x) > 0 for x in found)
+
+
+# --- derivatives that are not those of the operations ---------------------------------------------
+
+
+class Step(torch.autograd.Function):
+    """A step with the slope of a sigmoid, as for training."""
+
+    @staticmethod
+    def forward(ctx, x):
+        ctx.save_for_backward(x)
+        return torch.where(x > 0.6, 1.0, 0.0).to(x.dtype)
+
+    @staticmethod
+    def backward(ctx, back):
+        s = torch.sigmoid(8 * (ctx.saved_tensors[0] - 0.6))
+        return back * 8 * s * (1 - s)
+
+
+def stepped(u, s, p, cell):
+    return {"a": Step.apply(p.k * u.a) - u.a, "b": 0.0 * u.b}
+
+
+def without_gradients(u, s, p, cell):
+    with torch.no_grad():
+        held = p.k * u.a
+    return {"a": p.k + held - 2 * u.a, "b": 0.0 * u.b}
+
+
+def detached(u, s, p, cell):
+    return {"a": p.k + (p.k * u.a).detach() - 2 * u.a, "b": 0.0 * u.b}
+
+
+def slope_of(given, segment=2, **options) -> float:
+    k = torch.tensor(1.3, dtype=F64, requires_grad=True)
+    made = scene(given, {"k": k}, initial={"a": 0.5, "b": 0.0}, **options)
+    end = tf.rollout(made.bind(dtype=F64), until=0.6, segment=segment)
+    return float(torch.autograd.grad(end.fields["a"].sum(), k)[0])
+
+
+@pytest.mark.parametrize("given", [stepped, without_gradients])
+def test_a_derivative_of_the_users_own_is_taken(given):
+    wanted = slope_of(given, method="rk4", steps=64)
+    assert abs(wanted) > 0.1
+    for backend in ("compiled", "torch"):
+        assert slope_of(given, backend=backend, rtol=1e-8) == pytest.approx(wanted, rel=2e-3)
+
+
+def test_the_derivative_is_not_that_of_the_operations():
+    """Of a step it is 0."""
+    assert slope_of(lambda u, s, p, c: {"a": torch.where(p.k * u.a > 0.6, 1.0, 0.0) - u.a}) == 0.0
+
+
+def test_what_is_held_constant_is_so_either_way_to_write_it():
+    given = {"rtol": 1e-6, "backend": "compiled"}
+    assert slope_of(without_gradients, **given) == slope_of(detached, **given)
+
+
+def test_explain_says_whose_derivative_it_is():
+    said = tf.explain(scene(stepped, {"k": 1.3}), seconds=0)
+    assert "compiled functions of its equations; gradients by torch, since Step has a deriv" in said
+    assert "gradients by up to" in tf.explain(scene(without_gradients, {"k": 1.3}), seconds=0)
+
+
+def by_energy(u, s, p, cell):
+    """The slope of an energy, which torch finds in the rates."""
+    with torch.enable_grad():
+        at = u.a if u.a.requires_grad else u.a.detach().requires_grad_()
+        energy = (p.k * at**2 + 0.1 * at**4).sum()
+        (slope,) = torch.autograd.grad(energy, at, create_graph=True)
+    return {"a": 1.0 - slope, "b": 0.0 * u.b}
+
+
+def test_rates_that_take_gradients_themselves():
+    plain = lambda u, s, p, c: {"a": 1 - 2 * p.k * u.a - 0.4 * u.a**3}
+    wanted = slope_of(plain, rtol=1e-6)
+    assert abs(wanted) > 0.05
+    assert slope_of(by_energy, rtol=1e-6, segment=None) == pytest.approx(wanted, rel=1e-3)
+    assert slope_of(by_energy, method="heun2", steps=8) == pytest.approx(wanted, rel=1e-2)
+    with pytest.raises(tf.InputError, match=r"segment=None, or the circuit method='heun2'"):
+        slope_of(by_energy)

@@ -59,6 +59,14 @@ def test_weights_that_json_cannot_hold_are_refused(tmp_path):
     module = net()
     with torch.no_grad():
         module[0].bias[0] = torch.nan
-    with pytest.raises(tf.InputError, match=r"weights\['0.bias'\].*finite floating numbers"):
+    with pytest.raises(tf.InputError, match=r"weights\['0.bias'\].*finite real numbers"):
         save_weights(module, tmp_path / "net.json")
     assert not (tmp_path / "net.json").exists()
+
+
+def test_whole_numbers_that_a_module_counts_come_back(tmp_path):
+    first, second = (torch.nn.BatchNorm1d(2) for _ in range(2))
+    first(torch.rand(5, 2))
+    load_weights(second, save_weights(first, tmp_path / "net.json"))
+    assert int(second.num_batches_tracked) == 1
+    assert torch.equal(first.running_mean, second.running_mean)

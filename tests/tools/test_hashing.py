@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchfilm.tools.hashing import digest
+from torchfilm.tools.hashing import digest, digest_of_code, digest_of_weights, networks, trained
 
 
 def made(code: str):
@@ -132,3 +132,78 @@ def test_objects_that_refer_to_one_another_take_no_long_time():
         return things[0]
 
     assert digest(knot(7.0)) == digest(knot(7.0)) != digest(knot(8.0))
+
+
+# --- networks -------------------------------------------------------------------------------------
+
+
+class Own(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.scale = torch.nn.Parameter(torch.ones(1))
+        self.inner = torch.nn.Sequential(torch.nn.Linear(2, 3), torch.nn.BatchNorm1d(3))
+
+    def forward(self, x):
+        return self.scale * self.inner(x)
+
+
+def made_of(net):
+    return lambda x: net(x)
+
+
+def trained_one(make, step):
+    torch.manual_seed(0)
+    net = make()
+    with torch.no_grad():
+        for x in (*net.parameters(), *net.buffers()):
+            x += step
+    return net
+
+
+MODULES = {
+    "linear": lambda: torch.nn.Linear(2, 3),
+    "sequence": lambda: torch.nn.Sequential(torch.nn.Linear(2, 3), torch.nn.Tanh()),
+    "norm": lambda: torch.nn.BatchNorm1d(3),
+    "own": Own,
+}
+
+
+@pytest.mark.parametrize("make", MODULES.values(), ids=MODULES)
+@pytest.mark.parametrize("held", [lambda net: net, made_of, lambda net: {"net": [net]}, Thing])
+def test_weights_count_but_not_for_the_code(make, held):
+    one, same, other = (held(trained_one(make, step)) for step in (0, 0, 1))
+    assert digest(one) == digest(same) != digest(other)
+    assert digest_of_weights(one) == digest_of_weights(same) != digest_of_weights(other)
+    assert digest_of_code(one) == digest_of_code(other)
+    assert len(networks(one)) == 1
+
+
+def test_the_form_of_a_network_counts_for_the_code():
+    code = [digest_of_code(torch.nn.Sequential(torch.nn.Linear(2, n))) for n in (2, 3)]
+    assert code[0] != code[1]
+    assert digest_of_weights(made_of(3.0)) == "" and networks(made_of(3.0)) == []
+
+
+NET = torch.nn.Linear(1, 1)
+
+
+def test_a_network_that_a_function_finds_by_its_name_counts():
+    def f(x):
+        return NET(x)
+
+    before, code = digest(f), digest_of_code(f)
+    with torch.no_grad():
+        NET.weight += 1.0
+    assert digest(f) != before and digest_of_code(f) == code
+    assert [id(x) for x in trained(f)] == [id(x) for x in NET.parameters()]
+
+
+def test_what_an_optimiser_may_change():
+    weight, number = torch.ones(1, requires_grad=True), torch.ones(1)
+    net, bent = torch.nn.Linear(2, 1), 2 * weight
+
+    def f(x):
+        return net(x) + weight * number + bent
+
+    found = {id(x) for x in trained(f, {"again": net})}
+    assert found == {id(weight), *map(id, net.parameters())}

@@ -58,12 +58,15 @@ class CompiledStiff(Compiled):
         self, circuit: CircuitCells, start: Tensor, dt: float, rtol: float, atol: float
     ) -> tuple[Tensor, RosenbrockReport] | None:  # fmt: skip
         """As `rosenbrock.rodas3`, of the cells `circuit.rows`, with derivatives; None over no time,
-        where both kinds are wanted at once, and for gradients by too many numbers."""
+        where both kinds are wanted at once, for gradients by too many numbers, and where a user's
+        torch.autograd.Function has a derivative of its own."""
         if dt == 0:
             return None
         values = self.values(circuit, circuit.rows, pools(circuit, circuit.rows))
         if not tracked(start, *values.values()):
             return self._rodas3(values, start, dt, rtol, atol)
+        if self.equations.builder.own_derivative:
+            return None
         if only_forward(start, *values.values()):
             moving = {n for n, x in values.items() if has_tangent(x)}
             some = lambda names: tuple(n for n in names if n in moving)

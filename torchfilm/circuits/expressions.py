@@ -65,6 +65,10 @@ def walk(roots: Iterable[Expression]) -> Iterator[Expression]:
 class Builder:
     """Makes expressions; equal ones are the same object."""
 
+    #: a torch.autograd.Function of the user's that the expressions contain, whose derivative is
+    #: not that of its operations; "" without one
+    own_derivative = ""
+
     def __init__(self) -> None:
         self._made: dict[tuple, Expression] = {}
 

@@ -25,7 +25,7 @@ from torchfilm.circuits.formulas import latex, text
 from torchfilm.circuits.names import Names, UnknownName, has_no, unknown
 from torchfilm.circuits.network import Network, build_network
 from torchfilm.circuits.reactions import OUTSIDE
-from torchfilm.circuits.tracing import FULL, LAWS, Column, common_type
+from torchfilm.circuits.tracing import FULL, LAWS, Column, common_type, users_code
 from torchfilm.tools import checks
 from torchfilm.tools.deterministic_math import deterministic_functions
 
@@ -69,6 +69,7 @@ class Leaves(Names):
         return iter(self._known)
 
 
+@users_code()
 def traced_rates(
     part: Any, names: tuple[Names, Names, Names, Names], species: Sequence[str]
 ) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -24,8 +24,15 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from torchfilm.circuits import linear
+from torchfilm.tools.checks import InputError
 from torchfilm.tools.reads import known_rows_where, numbers, reads_are_free, rows_where
-from torchfilm.tools.tangents import both, forward_mode, outside_checkpoints, with_tangent
+from torchfilm.tools.tangents import (
+    both,
+    forward_mode,
+    in_forward_mode,
+    outside_checkpoints,
+    with_tangent,
+)
 
 # rates(u, rows): du/dt (M, S), conc/h, of the cells `rows` (M,) at concentrations u (M, S). Row i
 # of the result depends on row i of u only.
@@ -134,6 +141,7 @@ class _Tableau:
     ):
         self.rates, self.dtype, self.rtol, self.atol = rates, dtype, rtol, atol
         self.above, self.tracked, self.slopes = above, tracked, slopes
+        self.forward = True  # while forward derivatives of the rates are not known to fail
 
     def _least(self, u: Tensor) -> Tensor:
         """What a step from u (S, M) may lead to, (S, M)."""
@@ -154,10 +162,20 @@ class _Tableau:
         if self.slopes is not None:
             f, jacobian = self.evaluate(u, rows), self.slopes(u, rows)
             return f, torch.nan_to_num(jacobian, 0.0, 0.0, 0.0)
-        f, jacobian = self._forward(u, rows) if self.tracked else self._backward(u, rows)
+        f, jacobian = self._tracked(u, rows) if self.tracked else self._backward(u, rows)
         # the slope of a root at 0 is infinite; any finite value will do, since only the error
         # grows, and the error is controlled
         return f, torch.nan_to_num(jacobian, 0.0, 0.0, 0.0)
+
+    def _tracked(self, u: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Where a gradient is required. Functions without forward derivatives leave J without a
+        derivative of its own: what it would add is of the size of the step's error."""
+        if self.forward:
+            try:
+                return self._forward(u, rows)
+            except NotImplementedError:
+                self.forward = False
+        return self._backward(u, rows)
 
     def _backward(self, u: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """By a backward pass; the i-th copy gives the gradient of species i's rate."""
@@ -181,6 +199,11 @@ class _Tableau:
         every step from the start. Otherwise it is the slower way, since Python computes products
         with constants.
         """
+        if in_forward_mode():  # a gradient that the rates take has begun the segment once more
+            raise InputError(
+                "the rates of a circuit take a gradient themselves, which rollout cannot do again"
+                " by the stiff method: give it segment=None, or the circuit method='heun2'."
+            )
         size, count = u.shape
         copies = u.repeat(1, size)
         directions = (

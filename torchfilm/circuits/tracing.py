@@ -8,9 +8,13 @@ that arithmetic gives the same bits.
 from __future__ import annotations
 
 import math
+import sys
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import torch
@@ -144,6 +148,34 @@ def _power(x: Any, n: Any) -> Tensor:
     return steady.power(x, n)
 
 
+_TRACING: ContextVar[bool] = ContextVar("tracing", default=False)
+_OF_A_FUNCTION = torch.autograd.Function.apply.__func__.__code__  # type: ignore[attr-defined]
+
+
+@contextmanager
+def users_code() -> Iterator[None]:
+    """Within it a user's function is traced: also what it does to derivatives is noted."""
+    before = _TRACING.set(True)
+    try:
+        with torch.enable_grad():
+            yield
+    finally:
+        _TRACING.reset(before)
+
+
+def _with_its_derivative(made: Expression, builder: Builder) -> Expression:
+    """The expression with the derivative that the user's code gives it."""
+    if not _TRACING.get():
+        return made
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None and frame.f_code.co_name != TRACING:
+        if frame.f_code is _OF_A_FUNCTION:
+            builder.own_derivative = getattr(frame.f_locals.get("cls"), "__name__", "a function")
+            return made
+        frame = frame.f_back
+    return made if torch.is_grad_enabled() else builder.make("detach", made)
+
+
 # Functions made of others, by name: as rate laws, and as circuits evaluate powers and their like.
 LAWS: dict[str, Callable[..., Tensor]] = {
     "pow": _power,
@@ -176,7 +208,8 @@ def apply(op: str, *args: Any) -> Column:
             f"it calculates with whole numbers or truth values ({op}): write torch.where, or"
             f" .to(u.name.dtype){_place()}"
         )
-    return Column.of(first.builder.make(op, *parts), first.builder, *kind_of(op, kinds))
+    made = _with_its_derivative(first.builder.make(op, *parts), first.builder)
+    return Column.of(made, first.builder, *kind_of(op, kinds))
 
 
 # Numbers as a type; "full": as a column of that type, one value for each cell.

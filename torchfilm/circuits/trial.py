@@ -92,8 +92,8 @@ def _check_alone(
         if not torch.allclose(among, value.detach(), rtol=1e-4, atol=1e-30, equal_nan=True):
             raise InputError(
                 f"{label}: the rate of {name!r} in one cell depends on what other cells there are"
-                " (a sum or a mean over them, or a draw?). A rate function may use only its own"
-                " cell and the concentrations outside it."
+                " or on earlier calls (a sum or a mean over them, a draw, a change in place?). A"
+                " rate function may use only its own cell and the concentrations outside it."
             )
 
 

@@ -225,7 +225,9 @@ class BoundCircuit(BoundEffect):
     def numerics(self, dt: float, state: State) -> list[str]:
         transport = self.plan.transport  # where it is solved together with circuits
         exchanged = () if transport else self.exchanges()
-        lines = methods_of(self.effect, dt, self.plan.turns, self._why_torch(), exchanged)
+        known = [c for c in self.compiled.values() if not isinstance(c, str)]
+        own = next((x for c in known if (x := c.equations.builder.own_derivative)), "")
+        lines = methods_of(self.effect, dt, self.plan.turns, self._why_torch(), exchanged, own)
         each = self.effect.parameters.items()
         lines += [f"{n} {x.told}" for n, x in each if isinstance(x, Schedule)]
         if transport:

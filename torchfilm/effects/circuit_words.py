@@ -15,9 +15,11 @@ if TYPE_CHECKING:
 
 
 def methods_of(
-    circuit: Circuit, dt: float, turns: int, why_torch: Sequence[str], exchanged: Sequence[str]
-) -> list[str]:
-    """Lines on the method, on who computes it, and on the signals that take turns with it."""
+    circuit: Circuit, dt: float, turns: int, why_torch: Sequence[str], exchanged: Sequence[str],
+    own_derivative: str,
+) -> list[str]:  # fmt: skip
+    """Lines on the method, on who computes it, and on the signals that take turns with it.
+    own_derivative: a torch.autograd.Function in the rates, or ""."""
     molecules = (
         f"{number_range(numbers(circuit.molecules_per_unit))} molecules in a unit of concentration"
         " × µm³; no gradient"
@@ -37,7 +39,9 @@ def methods_of(
     lines = [said.get(circuit.method, explicit)]
     why = [f"computed by torch: {x}" for x in why_torch]
     gradients = "; where gradients are required by torch, with derivatives from them"
-    if circuit.method == "rosenbrock":
+    if circuit.method == "rosenbrock" and own_derivative:
+        gradients = f"; gradients by torch, since {own_derivative} has a derivative of its own"
+    elif circuit.method == "rosenbrock":
         gradients = f", gradients by up to {MOST_DIRECTIONS} numbers too"
     lines += why or [f"computed by compiled functions of its equations{gradients}"]
     if exchanged:

@@ -14,6 +14,7 @@ from torchfilm.physics.problem import ContactProblem
 from torchfilm.tools.cg import CGResult, conjugate_gradients, worst_of
 from torchfilm.tools.checks import SimulationError
 from torchfilm.tools.ragged import Blocks
+from torchfilm.tools.segments import keep, kept
 from torchfilm.tools.tangents import refuse_second
 from torchfilm.tools.threads import one_torch_thread
 
@@ -96,11 +97,12 @@ class _AdjointFunction(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, residual: Tensor, solve_again: _AdjointSolve) -> Tensor:
-        ctx.solve_again = solve_again
+        keep(ctx, solve_again)
         return torch.zeros_like(residual)
 
     @staticmethod
     def backward(ctx, grad: Tensor):
         refuse_second("contacts")
+        solve_again, _ = kept(ctx)
         with one_torch_thread():  # its many small operations would wait for others
-            return -ctx.solve_again(grad.contiguous()), None
+            return -solve_again(grad.contiguous()), None

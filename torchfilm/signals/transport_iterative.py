@@ -20,6 +20,7 @@ from torch import Tensor
 from torchfilm.signals.transport_operator import Operator, apply
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
+from torchfilm.tools.segments import keep, kept
 from torchfilm.tools.tangents import both, refuse_second, with_tangent
 from torchfilm.tools.threads import one_torch_thread
 
@@ -157,23 +158,24 @@ class _KrylovAdjoint(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, remainder: Tensor, x: Tensor, left: Map, of: Unsplit) -> Tensor:
-        ctx.left, ctx.of = left, of
+        keep(ctx, (left, of))
         return x.clone()
 
     @staticmethod
     def backward(ctx, grad: Tensor):
         refuse_second("a solve of transport")
-        left, symmetric = ctx.left, ctx.of.operator.symmetric
+        (forward, of), _ = kept(ctx)
+        left, symmetric = forward, of.operator.symmetric
         if not symmetric:
             with torch.enable_grad():
                 at = torch.zeros_like(grad, requires_grad=True)
-                value = ctx.left(at)
+                value = forward(at)
 
             def left(x: Tensor) -> Tensor:
                 return torch.autograd.grad(value, at, x, retain_graph=True)[0]
 
         with torch.no_grad(), one_torch_thread():
-            first, of = torch.zeros_like(grad), ctx.of
+            first = torch.zeros_like(grad)
             # where next to nothing is left, losses may depend on it a million times as strongly:
             # the residual there is not one of other voxels
             found, report = krylov(

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.tools.ragged import Groups
+from torchfilm.tools.segments import keep, kept
 from torchfilm.tools.tangents import (
     both,
     in_forward_mode,
@@ -224,29 +225,28 @@ class _Adjoint(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, change: Tensor, x: Tensor, function, groups, settings, known) -> Tensor:
-        ctx.function, ctx.groups, ctx.settings, ctx.known = function, groups, settings, known
-        ctx.save_for_backward(x)
+        keep(ctx, (function, groups, settings, known), x)
         return x.clone()
 
     @staticmethod
     def backward(ctx, grad: Tensor):
-        close, most, what = ctx.settings
+        (function, groups, (close, most, what), known), (x,) = kept(ctx)
         refuse_second(what)
-        if ctx.known is not None:
-            at, value = ctx.known
+        if known is not None:
+            at, value = known
         else:
             with torch.enable_grad():
-                at = ctx.saved_tensors[0].detach().requires_grad_()
-                value = ctx.function(at)
+                at = x.detach().requires_grad_()
+                value = function(at)
 
         def pulled(x: Tensor) -> Tensor:
             back = torch.autograd.grad(value, at, x, retain_graph=True, allow_unused=True)[0]
             return grad + _zero_if_none(back, x)
 
-        size = _sizes(grad, ctx.groups)
+        size = _sizes(grad, groups)
         with one_torch_thread():
-            found = fixed_point(pulled, grad, lambda x, new: size, ctx.groups, close, most)
-        return _nan_where(found.failed, found.x, ctx.groups), None, None, None, None, None
+            found = fixed_point(pulled, grad, lambda x, new: size, groups, close, most)
+        return _nan_where(found.failed, found.x, groups), None, None, None, None, None
 
 
 def _nan_where(failed: Tensor, x: Tensor, groups: Groups) -> Tensor:

@@ -7,7 +7,7 @@ import dis
 import hashlib
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from inspect import unwrap
 from pathlib import Path
@@ -29,44 +29,98 @@ def digest(*things: Any) -> str:
     Lists and tuples count as equal if their items do, and floats of any precision if their values
     do. A function counts by its code, its defaults, its closure and the globals of its own module
     that it uses. Its name, line numbers and docstring do not count. An object of a user's class
-    counts by its attributes and methods. Names imported from other modules are not followed.
-    Different versions of Python may compile one function in different ways, and so give different
-    digests.
+    counts by its attributes and methods, a torch.nn module by its form and its weights, wherever it
+    is defined. Names imported from other modules are not followed. Different versions of Python may
+    compile one function in different ways, and so give different digests.
     """
-    hasher = hashlib.sha256()
-    _add(hasher, things, set(), {})
-    return hasher.hexdigest()[:16]
+    return _Word(weights=True).of(things)
 
 
-def _add(hasher: Any, thing: Any, enclosing: set[int], met: dict[int, int]) -> None:
-    """met: the numbers of the objects of users' classes that were met before, by their ids."""
-    if isinstance(thing, torch.Tensor):
-        thing = thing.detach().cpu().numpy()
-    if isinstance(thing, np.ndarray):
-        if thing.dtype.kind == "f":
-            # a number from a file equals the written number, in any precision
-            thing = thing.astype(np.float64)
-        hasher.update(
-            f"array {thing.dtype} {thing.shape} ".encode() + np.ascontiguousarray(thing).tobytes()
-        )
-        return
-    if isinstance(thing, (str, bytes, int, float, bool, complex, type(None))):
-        hasher.update(f"{type(thing).__name__} {thing!r};".encode())
-        return
-    if id(thing) in enclosing:  # an object that contains itself, such as a recursive function
-        hasher.update(b"again;")
-        return
-    if _is_plain_object(thing):  # objects that refer to one another have many ways to each
-        if id(thing) in met:
-            hasher.update(f"object {met[id(thing)]} again;".encode())
+def digest_of_code(*things: Any) -> str:
+    """As `digest`, but that the weights of networks do not count, which training changes."""
+    return _Word(weights=False).of(things)
+
+
+def digest_of_weights(*things: Any) -> str:
+    """A word for the weights and buffers of the networks that these use; "" without a network."""
+    found = [x.state_dict() for x in networks(*things)]
+    return digest(found) if found else ""
+
+
+def networks(*things: Any) -> list[torch.nn.Module]:
+    """The torch.nn modules that these use, in a fixed order; those inside of others are theirs."""
+    return [x for x in _objects(things) if isinstance(x, torch.nn.Module)]
+
+
+def trained(*things: Any) -> list[torch.Tensor]:
+    """The tensors that these use and an optimiser may change: weights, and those that require
+    gradients."""
+    found: list[torch.Tensor] = []
+    for thing in _objects(things):
+        if isinstance(thing, torch.nn.Module):
+            found += thing.parameters()
+        elif isinstance(thing, torch.Tensor) and thing.is_leaf and thing.requires_grad:
+            found.append(thing)
+    return found
+
+
+def _objects(things: tuple[Any, ...]) -> Iterator[Any]:
+    """Every object that counts for a digest, once; a module for all that it holds."""
+    seen: dict[int, Any] = {}  # with the object itself, whose id may not be given to another
+    queue = list(reversed(things))
+    while queue:
+        thing = queue.pop()
+        if isinstance(thing, _NUMBERS) or id(thing) in seen:
+            continue
+        seen[id(thing)] = thing
+        yield thing
+        if not isinstance(thing, (torch.nn.Module, torch.Tensor)):
+            queue += reversed(_parts(thing, weights=True))
+
+
+_NUMBERS = (str, bytes, int, float, bool, complex, type(None), np.ndarray)
+
+
+class _Word:
+    """The digest of some things while it is made. weights: whether those of networks count."""
+
+    def __init__(self, *, weights: bool):
+        self.weights, self.hasher = weights, hashlib.sha256()
+        #: the numbers of the objects of users' classes that were met before, by their ids
+        self.met: dict[int, int] = {}
+
+    def of(self, thing: Any) -> str:
+        self._add(thing, set())
+        return self.hasher.hexdigest()[:16]
+
+    def _add(self, thing: Any, enclosing: set[int]) -> None:
+        if isinstance(thing, torch.Tensor):
+            thing = thing.detach().cpu().numpy()
+        if isinstance(thing, np.ndarray):
+            if thing.dtype.kind == "f":
+                # a number from a file equals the written number, in any precision
+                thing = thing.astype(np.float64)
+            about = f"array {thing.dtype} {thing.shape} ".encode()
+            self.hasher.update(about + np.ascontiguousarray(thing).tobytes())
             return
-        met[id(thing)] = len(met)
-    enclosing = enclosing | {id(thing)}
-    # a list may have been a tuple before it was written to a file
-    hasher.update(f"{'list' if isinstance(thing, tuple) else type(thing).__name__}(".encode())
-    for part in _parts(thing):
-        _add(hasher, part, enclosing, met)
-    hasher.update(b")")
+        if isinstance(thing, _NUMBERS):
+            self.hasher.update(f"{type(thing).__name__} {thing!r};".encode())
+            return
+        if id(thing) in enclosing:  # an object that contains itself, such as a recursive function
+            self.hasher.update(b"again;")
+            return
+        if _is_plain_object(thing):  # objects that refer to one another have many ways to each
+            if id(thing) in self.met:
+                self.hasher.update(f"object {self.met[id(thing)]} again;".encode())
+                return
+            self.met[id(thing)] = len(self.met)
+        enclosing = enclosing | {id(thing)}
+        # a list may have been a tuple before it was written to a file
+        kind = "list" if isinstance(thing, tuple) else type(thing).__name__
+        self.hasher.update(f"{kind}(".encode())
+        for part in _parts(thing, weights=self.weights):
+            self._add(part, enclosing)
+        self.hasher.update(b")")
 
 
 # The names of the script that runs, in its own process and in those that it starts.
@@ -74,7 +128,7 @@ SCRIPT = ("__main__", "__mp_main__")
 OURS = ("torchfilm", "design", "torch", "numpy", "builtins")
 
 
-def _parts(thing: Any) -> list[Any]:
+def _parts(thing: Any, *, weights: bool) -> list[Any]:
     """The parts of an object that count for its digest."""
     if isinstance(thing, FunctionType):
         closure = [c.cell_contents for c in thing.__closure__ or () if not _is_empty(c)]
@@ -113,9 +167,12 @@ def _parts(thing: Any) -> list[Any]:
         # fields without repr are derived, not given by the user
         given = [getattr(thing, f.name) for f in dataclasses.fields(thing) if f.repr]
     elif kind.__module__.split(".")[0] in OURS:
-        return [kind.__qualname__, without_addresses(repr(thing))]
+        about = [kind.__qualname__, without_addresses(repr(thing))]
+        return about + (_inside(thing, weights) if isinstance(thing, torch.nn.Module) else [])
     else:
         held = getattr(thing, "__dict__", {}) | _slots(thing)
+        if isinstance(thing, torch.nn.Module) and not weights:
+            held = {n: x for n, x in held.items() if n not in WEIGHTS}
         given = [x for name, value in held.items() for x in (name, value)]
     # a user's class also counts by its functions
     own = [c for c in kind.__mro__ if c.__module__.split(".")[0] not in OURS]
@@ -124,6 +181,16 @@ def _parts(thing: Any) -> list[Any]:
         *given,
         *(f for c in own for f in vars(c).values() if isinstance(f, FunctionType)),
     ]
+
+
+# What a torch.nn module keeps its numbers in.
+WEIGHTS = ("_parameters", "_buffers")
+
+
+def _inside(module: torch.nn.Module, weights: bool) -> list[Any]:
+    """What counts of a module of torch's own, besides its repr."""
+    numbers = [dict(module.named_parameters(recurse=False)), dict(module.named_buffers("", False))]
+    return [dict(module.named_children()), *(numbers if weights else [])]
 
 
 def _imported(text: str) -> str:
@@ -202,6 +269,7 @@ def _globals(function: FunctionType) -> list[Any]:
         if isinstance(x, plain)
         or (dataclasses.is_dataclass(x) and not isinstance(x, type))
         or (isinstance(x, FunctionType) and x.__module__ == function.__module__)
+        or isinstance(x, torch.nn.Module)
         or type(x).__module__ == function.__module__
     ]
 

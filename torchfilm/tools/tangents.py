@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from functools import cache
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+
+from torchfilm.tools.segments import no_segment
 
 
 @contextmanager
@@ -37,10 +39,12 @@ def _prepare_forward_mode() -> None:
             forward_ad.make_dual(torch.ones(1), torch.ones(1)).exp()
 
 
-def outside_checkpoints() -> AbstractContextManager[object]:
+@contextmanager
+def outside_checkpoints() -> Iterator[None]:
     """Within it, what torch saves for a backward pass is not for a checkpoint that is under way:
     where the pass is done at once, or the work is done once and not again for a checkpoint."""
-    return torch.autograd.graph.saved_tensors_hooks(lambda x: x, lambda x: x)
+    with torch.autograd.graph.saved_tensors_hooks(lambda x: x, lambda x: x), no_segment():
+        yield
 
 
 def may_be_checkpoint() -> bool:

@@ -1,0 +1,172 @@
+"""Long runs with gradients: what a rollout keeps, and what may not change before the way back."""
+
+from __future__ import annotations
+
+import gc
+
+import pytest
+import torch
+
+import torchfilm as tf
+from torchfilm.physics.adjoint import _AdjointSolve
+from torchfilm.tools.segments import Segment, keep, kept, no_segment
+
+F64 = torch.float64
+BOX = {"box": ((-16, -16), (16, 16)), "spacing": 4.0}
+
+
+def talking(u, s, p, cell):
+    return {"a": p.k - u.a + s.out}, {"out": cell.area * (u.a - s.out)}
+
+
+def pushing(rate, contacts="one-sided") -> tf.Scene:
+    mechanics = tf.Mechanics(dim=2, tolerance=1e-7, contacts=contacts)
+    founders = tf.inoculum(12, radius=5.0, seed=0)
+    return tf.Scene(tf.Growth(rate=rate), mechanics, founders=founders, dt=0.05)
+
+
+def exchanging(k, diffusion=10.0, flow=None) -> tf.Scene:
+    out = tf.Signal(diffusion=diffusion, decay=0.5)
+    medium = tf.Medium(out=out, **BOX, **({} if flow is None else {"flow": flow}))
+    founders = tf.inoculum(5, radius=5.0, seed=0)
+    circuit = tf.Circuit(talking, species="a", k=k)
+    return tf.Scene(tf.Growth(rate=0.3), circuit, medium, founders=founders, dim=2, dt=0.05)
+
+
+def skew(x):
+    return torch.stack([20.0 * (1 - (x[:, 1] / 16) ** 2), 0 * x[:, 1], 0 * x[:, 1]], 1)
+
+
+CASES = {
+    "contacts": (pushing, lambda end: end.position.square().sum()),
+    "bilateral": (lambda x: pushing(x, "bilateral"), lambda end: end.position.square().sum()),
+    "exchange": (exchanging, lambda end: end.a.sum()),
+    "solved": (lambda x: exchanging(x, 1e5, skew), lambda end: end.a.sum()),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_gradients_whatever_the_segment(case):
+    made, measure = CASES[case]
+    x, slopes = torch.tensor(0.8, dtype=F64, requires_grad=True), []
+    for segment in (None, 1, 3):
+        end = tf.rollout(made(x).bind(dtype=F64), until=0.4, segment=segment)
+        loss = measure(end)
+        once, again = (torch.autograd.grad(loss, x, retain_graph=r)[0] for r in (True, False))
+        assert torch.equal(once, again)
+        slopes.append(once)
+    assert torch.allclose(slopes[0], slopes[1], rtol=1e-12)
+    assert torch.equal(slopes[1], slopes[2]) and abs(float(slopes[0])) > 1e-3
+
+
+def test_no_contact_problem_is_kept():
+    x, counts = torch.tensor(0.8, dtype=F64, requires_grad=True), []
+    for segment in (None, 4):
+        model = pushing(x).bind(dtype=F64)
+        end = tf.rollout(model, until=0.4, segment=segment)
+        gc.collect()
+        count = lambda: sum(type(x) is _AdjointSolve for x in gc.get_objects())
+        counts.append(count())
+        end.position.sum().backward()
+        gc.collect()
+        counts.append(count())
+        del end, model
+    assert counts[0] >= 8 and counts[2:] == [0, 0]
+
+
+class Doubled(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x, things):
+        keep(ctx, things, x)
+        return 2 * x
+
+    @staticmethod
+    def backward(ctx, back):
+        things, (x,) = kept(ctx)
+        things.append(float(x))
+        return 2 * back, None
+
+
+def test_things_are_kept_in_the_second_run_of_a_segment():
+    x, segment, runs = torch.tensor(3.0, requires_grad=True), Segment(), []
+
+    def steps(x):
+        with segment.steps() as again:
+            runs.append((again, ["made here"]))
+            return Doubled.apply(Doubled.apply(x, runs[-1][1]), runs[-1][1])
+
+    y = torch.utils.checkpoint.checkpoint(steps, x, use_reentrant=False)
+    assert [again for again, _ in runs] == [False] and not segment._things
+    for number in (1, 2):
+        (slope,) = torch.autograd.grad(y, x, retain_graph=True)
+        assert float(slope) == 4.0 and len(runs) == 1 + number and not segment._things
+        assert runs[0] == (False, ["made here"])
+        assert runs[number] == (True, ["made here", 6.0, 3.0])
+
+
+def test_things_are_kept_outside_of_a_segment():
+    x, things = torch.tensor(3.0, requires_grad=True), []
+    Doubled.apply(x, things).backward()
+    with Segment().steps(), no_segment():
+        y = Doubled.apply(x, things)
+    y.backward()
+    assert things == [3.0, 3.0]
+
+
+# --- what changes before the way back -------------------------------------------------------------
+
+
+def controlled(net) -> tf.Scene:
+    def rates(u, s, p, cell):
+        return {"a": net(u.a[:, None])[:, 0] - u.a}
+
+    circuit = tf.Circuit(rates, species="a", initial={"a": 1.0}, method="heun2")
+    return tf.Scene(tf.Growth(rate=0.3), circuit, dim=2, dt=0.1)
+
+
+def test_weights_that_change_before_the_gradient_are_refused():
+    torch.manual_seed(0)
+    net = torch.nn.Sequential(torch.nn.Linear(1, 3), torch.nn.Tanh(), torch.nn.Linear(3, 1))
+    rule = torch.optim.SGD(net.parameters(), 0.1)
+    for _ in range(2):
+        rule.zero_grad()
+        end = tf.rollout(controlled(net), until=0.6, segment=2)
+        end.a.sum().backward()  # as it should be
+        rule.step()
+    end = tf.rollout(controlled(net), until=0.6, segment=2)
+    rule.step()
+    with pytest.raises(tf.InputError, match=r"changed between rollout and.*segment=None"):
+        end.a.sum().backward()
+    weight = torch.ones(1, requires_grad=True)
+    end = tf.rollout(controlled(lambda x: weight * x), until=0.6, segment=2)
+    with torch.no_grad():
+        weight.mul_(2.0)
+    with pytest.raises(tf.InputError, match="changed between rollout and"):
+        end.a.sum().backward()
+
+
+# --- where a first state comes from ---------------------------------------------------------------
+
+
+def test_a_first_state_that_is_edited_in_place_leaves_the_model_as_it_is():
+    circuit = tf.Circuit(lambda u, s, p, cell: {"a": 1 - u.a}, species="a")
+    growth = tf.Growth(rate=1.0), tf.Division(length=3.5)
+    model = tf.Scene(*growth, circuit, tf.Medium(**BOX, out=tf.Signal(diffusion=1.0)), dim=2).bind()
+    first, plain = model.start(), model.start()
+    for value in (*first.fields.values(), first.position, first.length, first.radius):
+        if value.is_floating_point():
+            value.fill_(5.0)
+    again = model.start()
+    assert all(torch.equal(again.fields[n], x) for n, x in plain.fields.items())
+    assert torch.equal(again.radius, plain.radius) and torch.equal(again.length, plain.length)
+
+
+@pytest.mark.parametrize("case", ["contacts", "exchange"])
+def test_a_model_that_is_bound_in_inference_mode_gives_gradients_later(case):
+    made, measure = CASES[case]
+    x = torch.tensor(0.8, dtype=F64, requires_grad=True)
+    with torch.inference_mode():
+        model = made(x).bind(dtype=F64)
+    (slope,) = torch.autograd.grad(measure(tf.rollout(model, until=0.4)), x)
+    (plain,) = torch.autograd.grad(measure(tf.rollout(made(x).bind(dtype=F64), until=0.4)), x)
+    assert torch.equal(slope, plain) and float(slope) != 0.0

@@ -1,0 +1,73 @@
+"""What a Function keeps for its backward pass, also in a segment of steps of which a checkpoint
+keeps the first state only.
+
+Torch's checkpoint drops the tensors that a Function saves, and gets them from doing the steps once
+more. What a Function keeps in other ways it would keep twice. So in a segment such things are kept
+in the second run only, under a number that the Function saves as a tensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from itertools import count
+from typing import Any
+
+import torch
+from torch import Tensor
+
+_NOW: ContextVar[tuple[Segment, bool] | None] = ContextVar("segment", default=None)
+
+
+class Segment:
+    """Steps that are done once for their result, and once more for each backward pass."""
+
+    def __init__(self) -> None:
+        self._numbers, self._things = count(), dict[int, Any]()
+        self._done = False
+
+    @contextmanager
+    def steps(self) -> Iterator[bool]:
+        """Around the steps, each time; whether it is for a backward pass."""
+        again, self._done = self._done, True
+        before = _NOW.set((self, again))
+        try:
+            yield again
+        finally:
+            _NOW.reset(before)
+
+    def put(self, things: Any) -> int:
+        number = next(self._numbers)
+        self._things[number] = things
+        return number
+
+    def take(self, number: int) -> Any:
+        return self._things.pop(number)
+
+
+@contextmanager
+def no_segment() -> Iterator[None]:
+    """Within it everything is kept, as outside of a segment."""
+    before = _NOW.set(None)
+    try:
+        yield
+    finally:
+        _NOW.reset(before)
+
+
+def keep(ctx: Any, things: Any, *tensors: Tensor) -> None:
+    """Keep this for the backward pass of a Function, in place of `ctx.save_for_backward`."""
+    now, number = _NOW.get(), -1
+    ctx.things, ctx.segment = things, None
+    if now is not None:
+        ctx.things, ctx.segment = None, now[0]
+        number = now[0].put(things) if now[1] else -1
+    ctx.save_for_backward(torch.tensor(number), *tensors)
+
+
+def kept(ctx: Any) -> tuple[Any, tuple[Tensor, ...]]:
+    """What `keep` was given, once in a backward pass: things, and tensors."""
+    number, *tensors = ctx.saved_tensors
+    things = ctx.things if ctx.segment is None else ctx.segment.take(int(number))
+    return things, tuple(tensors)
