@@ -73,8 +73,8 @@ class Leaves(Names):
 def traced_rates(
     part: Any, names: tuple[Names, Names, Names, Names], species: Sequence[str]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What a rate function, or a network, gives for traced columns (u, s, p, cell): rates of
-    species, conc/h, and amounts released to signals, conc·µm³/h: columns or numbers."""
+    """What a rate function, or a network, gives for traced columns: rates of species, conc/h, and
+    amounts released to signals, conc·µm³/h: columns or numbers."""
     if isinstance(part, Network):
         found = part.changes(part.concentration_rates(*names))
         split = len(species)
