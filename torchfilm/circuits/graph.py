@@ -78,10 +78,8 @@ def traced_rates(
     if isinstance(part, Network):
         found = part.changes(part.concentration_rates(*names))
         split = len(species)
-        released = zip(part.signals, found[split:], strict=True)
-        return dict(zip(species, found[:split], strict=True)), {
-            n: x * names[3].volume for n, x in released
-        }
+        released = zip(part.signals, (x * names[3].volume for x in found[split:]), strict=True)
+        return dict(zip(species, found[:split], strict=True)), dict(released)
     return both_of(part(*names))
 
 
