@@ -16,7 +16,7 @@ from design.front_plot import draw_front
 from design.objective import Objective
 from design.parameters import Value, right_aligned, show_value
 from design.pareto import nondominated, spread
-from design.report import at_bound, cells_in, cost_words, failure_words
+from design.report import at_bound, cells_in, constrained, cost_words, failure_words
 from design.study import Study
 from design.targets.goals import Constrained, Goals, in_words, of_seeds
 from design.trivial import trivial_losses
@@ -103,7 +103,7 @@ class Front:
     def _remarks(self) -> list[str]:
         """What to know of the designs, and of the search."""
         task, study, lines = self.search.objective.task, self.search.study, []
-        if task.target.bounds and self.goals.min() >= Constrained.BROKEN / self._seeds:
+        if constrained(task.target) and self.goals.min() >= Constrained.BROKEN / self._seeds:
             bounds = in_words(task.target.bounds)
             lines.append(f"no design meets the constraints ({bounds}): these miss them by least.")
         for p in task.space.parameters:
@@ -120,7 +120,7 @@ class Front:
                 each = ", ".join(f"{name} {loss:.3f}" for name, loss in found.items())
                 lines.append(f"{title} without a pattern: {each}")
         spent = f"{cost_words(study)}; {study.about.get('method', '')}".rstrip("; ")
-        return [*lines, *failure_words(study), spent]
+        return [*lines, *failure_words(study, task.target), spent]
 
     @property
     def _seeds(self) -> int:

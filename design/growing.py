@@ -12,6 +12,7 @@ from torch import Tensor
 import torchfilm as tf
 from design import colonies
 from design.colonies import PreparedColonies
+from design.targets.measured import NO_CELLS
 
 # h: a colony that has not gained a cell for so long is given up
 PATIENCE = 100.0
@@ -95,7 +96,7 @@ def _failed(state: tf.State, fewest: int) -> tuple[list[FailedColony], Tensor]:
         return out, gone
     empty = (state.counts == 0) & ~gone
     out += [
-        FailedColony(colony_id, f"no cells remain at {state.time:g} h")
+        FailedColony(colony_id, f"{NO_CELLS} at {state.time:g} h")
         for colony_id in state.colony_id[empty].tolist()
     ]
     return out, gone | empty

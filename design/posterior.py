@@ -16,7 +16,7 @@ from design.prediction import Prediction
 from design.prior import Prior
 from design.simulations import Simulations, random_points, shown_values, simulate_points
 from design.targets.conditions import Conditions
-from design.targets.measured import Measured
+from design.targets.measured import Measured, extinct_words
 from design.targets.observed import Observed
 from design.targets.observed_conditions import averaged, cells_each, checked_data
 from design.targets.statistics import LOG_CELLS
@@ -177,7 +177,11 @@ class Posterior:
                 line += f"  {100 * share:.0f} % of the samples"
             lines.append(line)
         lines.append(f"from {len(self.simulations)} simulations; {self.observed.describe()}")
-        lines += [f"{n} simulations failed: {why}" for why, n in self.simulations.failures()[:3]]
+        failures = self.simulations.failures()
+        lines += [f"{n} simulations failed: {why}" for why, n in failures[:3]]
+        if len(failures) > 3:
+            lines.append(f"{sum(n for _, n in failures[3:])} simulations failed for other reasons")
+        lines += extinct_words(self.observed, [why for why, _ in failures])
         lines += [
             f"{one} and {other} are not told apart: their correlation is {r:.2f}"
             for (one, other), r in self.correlations.items()

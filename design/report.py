@@ -17,6 +17,7 @@ from design.study import Study
 from design.targets.base import Target
 from design.targets.goals import Constrained, Goals
 from design.targets.lasting import Lasting
+from design.targets.measured import extinct_words
 from design.task import Task
 from design.trivial import EVERY_SECOND, trivial_losses
 
@@ -94,7 +95,7 @@ def table(report: SearchReport) -> str:
     ]
     lines += _undefined(target, new)
     lines += _warnings(report)
-    lines += failure_words(study)
+    lines += failure_words(study, target)
     how = (
         f"grown again for each design: {report.why_regrown}"
         if report.why_regrown
@@ -106,10 +107,11 @@ def table(report: SearchReport) -> str:
     return "\n".join(lines)
 
 
-def failure_words(study: Study) -> list[str]:
+def failure_words(study: Study, target: Target) -> list[str]:
     """The most frequent failure of a search, if there is one."""
-    each = study.failures()[:1]
-    return [f"most frequent failure: {reason} ({times} colonies)" for reason, times in each]
+    each = study.failures()
+    lines = [f"most frequent failure: {reason} ({times} colonies)" for reason, times in each[:1]]
+    return lines + extinct_words(target, [reason for reason, _ in each])
 
 
 def cost_words(study: Study) -> str:
@@ -264,7 +266,7 @@ def _missed(report: SearchReport) -> str:
     """Which constraints colonies of the best design break."""
     target, best = report.task.target, report.best
     losses = best.losses if best.fresh is None else best.fresh.losses
-    if not target.bounds or not best.colonies or np.max(losses) < Constrained.BROKEN:
+    if not constrained(target) or not best.colonies or np.max(losses) < Constrained.BROKEN:
         return ""
     found = each_measured(target, best.colonies)
     broken = {n: b for n, b in target.bounds.items() if _breaks(b, found[n])} or target.bounds
@@ -284,7 +286,12 @@ def _breaks(bound: str, found: Sequence[float]) -> bool:
 
 def misses_constraints(target: Target, loss: np.ndarray | float) -> np.ndarray:
     """Whether losses are those of designs that miss constraints, in some colonies at least."""
-    return np.logical_and(bool(target.bounds), np.asarray(loss) >= Constrained.BROKEN / MANY)
+    return np.logical_and(constrained(target), np.asarray(loss) >= Constrained.BROKEN / MANY)
+
+
+def constrained(target: Target) -> bool:
+    """Whether a target has constraints, or one of its parts."""
+    return isinstance(target, Constrained) or any(map(constrained, getattr(target, "parts", ())))
 
 
 def shown_loss(target: Target, loss: float) -> str:

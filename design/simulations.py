@@ -74,7 +74,7 @@ class Simulations:
 
     def failures(self) -> list[tuple[str, int]]:
         """The reasons of failures, without their times, and how often each came, most first."""
-        alike = (re.sub(r"^at \S+ h: ", "", words) for words in self.reasons.values())
+        alike = (re.sub(r"^at \S+ h: | at \S+ h$", "", words) for words in self.reasons.values())
         return Counter(alike).most_common()
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import KW_ONLY, dataclass, field
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from design.targets.base import WORST, Target, ended_elsewhere, requiring_gradie
 from torchfilm import checks
 
 Measure = Callable[[tf.State], Tensor]
+NO_CELLS = "no cells remain"  # why a colony without cells has failed
 FARTHEST = 100.0  # spreads: a measure that is farther off counts as so far
 
 
@@ -51,6 +52,7 @@ class Measured(Target):
     extinct: bool = False
     smooth: bool = False
     time: float | None = None
+    _warned: bool = field(default=False, init=False, repr=False, compare=False)
 
     @property
     def fewest(self) -> int:  # type: ignore[override]
@@ -85,6 +87,29 @@ class Measured(Target):
             self._found(state)
         except TypeError as error:
             raise tf.InputError(str(error)) from error
+        if not self._warned and not self.extinct and self._is_reached_without_cells(state):
+            object.__setattr__(self, "_warned", True)
+            warnings.warn(
+                f"a colony without cells is as it is wanted ({self.describe()}), but counts as"
+                " failed: Measured(…, extinct=True) measures it as any other.",
+                stacklevel=2,
+            )
+
+    def _is_reached_without_cells(self, state: tf.State) -> bool:
+        """Whether every measure of a colony without cells is less than a spread off."""
+        empty = state.remove(
+            torch.ones(state.cells, dtype=torch.bool, device=state.device), "removed"
+        )
+        try:
+            with torch.no_grad(), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                found = self._found(empty)
+        except Exception:  # of a function that takes no state without cells
+            return False
+        missed = self.misses({n: float(x[0]) for n, x in zip(self.functions, found, strict=True)})
+        return all(0 <= by < 1 for by in missed.values()) and not bool(
+            torch.stack(found).isnan().any()
+        )
 
     def unfit(self, state: tf.State) -> list[str]:
         bad = [
@@ -189,3 +214,19 @@ def _has_gradient(measure: Measure, tracked: tf.State) -> bool:
             return bool(measure(tracked).requires_grad)
     except (RuntimeError, TypeError, ValueError):  # as where it asks for NumPy's numbers
         return False
+
+
+def extinct_words(target: Target, reasons: Iterable[str]) -> list[str]:
+    """What to know where colonies without cells have failed that a target could measure. reasons:
+    of failures."""
+    if any(reason.startswith(NO_CELLS) for reason in reasons) and _leaves_out_extinct(target):
+        return ["colonies without cells have failed; extinct=True of the measures measures them"]
+    return []
+
+
+def _leaves_out_extinct(target: object) -> bool:
+    parts = (*getattr(target, "parts", ()), *getattr(target, "frames", ()))
+    wrapped = (getattr(target, name, None) for name in ("conditions", "measured"))
+    return getattr(target, "extinct", True) is False or any(
+        map(_leaves_out_extinct, (*parts, *(x for x in wrapped if x is not None)))
+    )
