@@ -109,6 +109,9 @@ class Together:
         medium.find()
         step, outcome, fixed = _solved(lambda: _Step(self, state, medium, dt, done, number))
         made, again, greedy = self._finished(state, step, outcome, fixed)
+        if number < FINEST * self.medium.effect.steps:
+            for name, moved in outcome.moved.items():
+                again = again | step.transport[name].coarse(moved)
         if not bool(again.any()):
             return made
         if number >= FINEST * self.medium.effect.steps:

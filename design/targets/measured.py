@@ -96,7 +96,7 @@ class Measured(Target):
             )
 
     def _is_reached_without_cells(self, state: tf.State) -> bool:
-        """Whether every measure of a colony without cells is less than a spread off."""
+        """Whether every measure of a colony without cells is as wanted."""
         empty = state.remove(
             torch.ones(state.cells, dtype=torch.bool, device=state.device), "removed"
         )
@@ -107,9 +107,7 @@ class Measured(Target):
         except Exception:  # of a function that takes no state without cells
             return False
         missed = self.misses({n: float(x[0]) for n, x in zip(self.functions, found, strict=True)})
-        return all(0 <= by < 1 for by in missed.values()) and not bool(
-            torch.stack(found).isnan().any()
-        )
+        return all(by == 0 for by in missed.values()) and not bool(torch.stack(found).isnan().any())
 
     def unfit(self, state: tf.State) -> list[str]:
         bad = [

@@ -41,7 +41,7 @@ def said_of(target) -> str:
 
 @pytest.mark.parametrize(
     "wanted, spread, is_said",
-    [(0.0, 1.0, True), (0.9, 1.0, True), ((0.0, 3.0), 1.0, True), ((-1.0, 3.0), 0.1, True),
+    [(0.0, 1.0, True), (0.1, 1.0, False), ((0.0, 3.0), 1.0, True), ((-1.0, 3.0), 0.1, True),
      (1.0, 1.0, False), (5.0, 1.0, False), ((2.0, 3.0), 1.0, False)],
 )  # fmt: skip
 def test_what_a_colony_without_cells_reaches_is_warned_of(wanted, spread, is_said):

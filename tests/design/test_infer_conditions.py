@@ -211,6 +211,7 @@ def killed(rate=1.0):
     return tf.Scene(tf.Lysis(rate=rate), founders=founders, dim=2, dt=0.1)
 
 
+@pytest.mark.filterwarnings("ignore:a colony without cells is as it is wanted")
 def test_colonies_in_which_all_have_died_are_data_where_they_count():
     """With a high rate none is left, which is what was seen."""
     count = lambda state: state.counts.double()

@@ -144,6 +144,7 @@ def draw(count, seed):
     return tf.inoculum(count, 20.0, seed=seed)
 
 
+@pytest.mark.filterwarnings("ignore:a colony without cells is as it is wanted")
 @pytest.mark.parametrize("end", [{"until": 1.0}, {"cells": 30, "until": 1.0}, {"cells": 30}])
 @pytest.mark.parametrize("extinct", [False, True])
 def test_colonies_in_which_all_have_died(extinct, end):

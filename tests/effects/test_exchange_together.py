@@ -214,7 +214,9 @@ def greedy(u, s, p, cell):
 
 def test_cells_that_take_what_is_not_there_are_named():
     made = resting(medium(), tf.Circuit(greedy, species="ahl"), SIX)
-    with pytest.raises(tf.SimulationError, match="cells take more of a signal than there is"):
+    # as the last part of a step begins with much or with next to nothing
+    named = "cells take more of a signal than there is|push a concentration below zero, 'out.ahl'"
+    with pytest.raises(tf.SimulationError, match=named):
         for _ in tf.simulate(made, until=0.2):
             pass
 

@@ -88,7 +88,8 @@ def test_gradients_are_those_of_diffusion(K):
     cells would like. At K = 1e-8 that by q had been −2.5 times what was taken over 25, since the
     adjoint was taken at a field that was off by the residual."""
     back, turned = derivatives(K, False), derivatives(K, True)
-    assert back[2] == pytest.approx(turned[2], rel=1e-4) and 13.0 < back[2] < 14.0
+    # 12.3 at K = 1e-4 in steps a 32nd as long
+    assert back[2] == pytest.approx(turned[2], rel=1e-4) and 11.5 < back[2] < 13.0
     assert back[:2] == pytest.approx(turned[:2], rel=1e-2, abs=1e-4)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from torchfilm.circuits.compiled_gradients import MOST_DIRECTIONS
 from torchfilm.parameters import number_range
 from torchfilm.signals.compiled_uptake import EVENTS
+from torchfilm.signals.joint import COARSE
 from torchfilm.values import numbers
 
 if TYPE_CHECKING:
@@ -62,7 +63,8 @@ def together_lines(exchanges: Mapping[str, float]) -> list[str]:
     for name, times in exchanges.items():
         lines.append(
             f"{name}: transport by backward Euler, order 1: voxels exchange {times:.3g} times a"
-            f" step, over {EVENTS:g}"
+            f" step, over {EVENTS:g}; in parts of a step while cells take over {100 * COARSE:g} %"
+            " of it in one"
             if times > EVENTS
             else f"{name}: transport by a series, order 2 in dt"
         )

@@ -31,6 +31,9 @@ TINY = 1e-300
 # cells that eat faster than diffusion brings would get more than that: a law such as s/(K + s) asks
 # for as much at 1e-10 of what there was.
 EMPTY = 1e15
+# What all cells of a colony may take of a signal by one step of backward Euler: in a closed box
+# half of that is left too much, so that what is left after a fall by e is 1 % off.
+COARSE = 0.02
 
 
 class Moved(NamedTuple):
@@ -175,6 +178,23 @@ class JointTransport:
         kept = torch.where(missing > 0, kept, 1.0)
         end = end * kept.index_select(0, self.grid.owner)
         return end, (missing - content).clamp(min=0.0), left
+
+    def coarse(self, moved: Moved) -> Tensor:
+        """The colonies, (B,) bool, for which the step is too long: they took backward Euler, whose
+        error is half the share that cells took times the share by which the content changed, and
+        these are more than COARSE, in the geometric mean."""
+        far = torch.zeros(self.groups.size, dtype=torch.bool, device=self.field.device)
+        for batch, own in zip(self.grid.batches, self._far, strict=True):
+            far[batch.colonies] = torch.as_tensor(own, device=far.device)
+        if not bool(far.any()):
+            return far
+        of_grids = Groups(self.grid.owner, self.groups.size, ordered=True)
+        fields = torch.stack([both(x.detach())[0].double() for x in (self.field, moved.end)], 1)
+        before, after = (of_grids.sum(fields) * self.grid.voxel_volume).unbind(1)
+        taken = self.groups.sum(both(moved.taken.detach())[0])
+        nothing = self.finest * self.grid.voxel_volume * of_grids.counts
+        products = taken * (after - before).abs()
+        return far & (products > COARSE**2 * after * before) & (before > nothing)
 
     def _spread(self, per_cell: Tensor) -> Tensor:
         """(N,) to the voxels."""

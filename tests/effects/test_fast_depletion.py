@@ -1,0 +1,120 @@
+"""Signals that diffuse fast and are taken from a closed box: the course in time."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import torchfilm as tf
+from torchfilm.effects.circuit_words import together_lines
+from torchfilm.signals import joint
+
+F64 = torch.float64
+FAST, VOXELS = 1.4e6, 8
+SIDE = 8.0 * VOXELS / 2
+
+
+def takes(u, s, p, cell):
+    return {"eaten": 0.0 * u.eaten}, {"drug": -p.k * s.drug * cell.volume}
+
+
+def gives(u, s, p, cell):
+    return {"eaten": 0.0 * u.eaten}, {"drug": p.k * cell.volume}
+
+
+def hungry(k, *, rates=takes, diffusion=FAST, dt=0.05, boundary=None, backend=None) -> tf.Scene:
+    faces = {} if boundary is None else {"boundary": boundary}
+    box = {"box": ((-SIDE, -SIDE), (SIDE, SIDE)), "spacing": 8.0, "depth": 1.0}
+    drug = tf.Signal(diffusion=diffusion, initial=4.0)
+    return tf.Scene(
+        tf.Circuit(rates, species="eaten", k=k, backend=backend),
+        tf.Medium(drug=drug, **box, **faces, backend=backend),
+        founders=tf.inoculum(30, radius=20.0, seed=0), dim=2, dt=dt,
+    )  # fmt: skip
+
+
+def rate_of(scene) -> float:
+    """That of the whole box, 1/h, for k = 1."""
+    first = scene.bind(dtype=F64).start()
+    return float(first.volume.sum()) / (2 * SIDE) ** 2
+
+
+K = 3.0 / rate_of(hungry(1.0))
+
+
+def left(scene, **options) -> float:
+    *_, last = tf.simulate(scene, until=1.0, dtype=F64, **options)
+    return float(last.signals["drug"].mean()) / 4.0
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+@pytest.mark.parametrize("dt", [0.025, 0.1])
+def test_what_is_left_falls_as_the_exponential(dt, backend):
+    """About 1 % too much after each fall by e; by whole steps it would be 12 % and 48 %."""
+    found = left(hungry(K, dt=dt, backend=backend))
+    assert math.exp(-3.0) < found < 1.035 * math.exp(-3.0)
+
+
+def test_whole_steps_are_far_off(monkeypatch):
+    monkeypatch.setattr(joint, "COARSE", math.inf)
+    assert left(hungry(K, dt=0.025)) == pytest.approx((1 + 3.0 * 0.025) ** -40, rel=2e-3)
+
+
+def test_cells_get_what_the_box_loses():
+    scene = hungry(K)
+    first = scene.bind(dtype=F64).start()
+    for state in tf.simulate(scene, first, until=0.5):
+        assert float(state.signals["drug"].min()) >= 0.0
+    own = state.reports["circuit"]
+    assert int(own.iterations.sum()) > 5 and int(own.unsolved.sum()) == 0
+
+
+def iterations(scene, monkeypatch, coarse, until=1.0):
+    monkeypatch.setattr(joint, "COARSE", coarse)
+    *_, last = tf.simulate(scene, until=until, dtype=F64)
+    return int(last.reports["circuit"].iterations), last.signals["drug"]
+
+
+FED = tf.BoundaryConditions(x=tf.Dirichlet(4.0), y=tf.NoFlux())
+
+
+@pytest.mark.parametrize(
+    "given", [{"boundary": FED}, {"rates": gives}, {"diffusion": 1e3}, {"k": 0.05 * K}]
+)
+def test_no_step_is_halved_without_need(given, monkeypatch):
+    """A steady supply, cells that give only, what diffuses so slowly that the series is exact, and
+    cells that take little."""
+    scene = hungry(**{"k": K, **given})
+    whole, halved = (iterations(scene, monkeypatch, x) for x in (math.inf, joint.COARSE))
+    assert whole[0] == halved[0] and torch.equal(whole[1], halved[1])
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_a_colony_that_needs_no_parts_has_the_same_bits_beside_one_that_does(backend):
+    k = torch.tensor([0.05, 1.0, 0.3], dtype=F64) * K
+    *_, many = tf.simulate(hungry(k, backend=backend), until=0.3, dtype=F64)
+    for number, own in enumerate(k):
+        alone = hungry(own.reshape(1), backend=backend)
+        *_, one = tf.simulate(alone, until=0.3, dtype=F64, streams=[number])
+        mine = many.select([number])
+        assert torch.equal(one.signals["drug"], mine.signals["drug"])
+
+
+def test_gradients_pass_the_parts():
+    k = torch.tensor(K, dtype=F64, requires_grad=True)
+    slopes = [(left_of(K + off) - left_of(K - off)) / (2 * off) for off in (1e-4 * K,)]
+    (found,) = torch.autograd.grad(left_of(k), k)
+    assert float(found) == pytest.approx(float(slopes[0]), rel=1e-4)
+    assert float(found * K) == pytest.approx(-0.6 * math.exp(-0.6), rel=2e-2)
+
+
+def left_of(k):
+    scene = hungry(k)
+    return tf.rollout(scene.bind(dtype=F64), until=0.2).signals["drug"].mean() / 4.0
+
+
+def test_it_is_explained():
+    assert "in parts of a step while cells take over 2 %" in together_lines({"drug": 1e3})[1]
+    assert "in parts" not in " ".join(together_lines({"drug": 100.0}))
