@@ -243,7 +243,7 @@ def _cannot_be_built(
     if kind:
         hints += (
             " If the scene takes a plain number or a name there, use whole=True or a Choice: a"
-            " Parameter arrives as a tensor with one value per colony."
+            " Parameter, and a number of Conditions, arrive as a tensor with one value per colony."
         )
     return tf.InputError(
         f"{kind}{str(error).rstrip('.')}. So the scene cannot be built with {changed or values}."

@@ -161,6 +161,8 @@ def test_of_another_scene_only_what_differs_is_named():
     assert said(first, scene(0.5, 4.0, ("steps", 2))) == (
         "Circuit: nothing there, 'steps=2' in this scene"
     )
+    courses = [scene(tf.Schedule({0: 0.5, 2: x}), 4.0) for x in (0.6, 0.7)]
+    assert said(*courses).endswith("values={0.0: 0.5, 2.0: 0.7' in this scene")
     added = tf.Scene(*first.effects, tf.Growth(rate=1.0), dim=2)
     assert said(first, added) == "this scene has 'Growth(rate=1.0)'"
 

@@ -61,7 +61,7 @@ def binned_mean(groups: Groups, value: Tensor, place: Tensor, edges: Sequence[fl
     """The mean of (N,) over the members of each group in each bin, (G, K); NaN in a bin without
     any."""
     bins, count = len(edges) - 1, groups.size * (len(edges) - 1)
-    at = torch.bucketize(place.detach(), place.new_tensor(edges), right=True) - 1
+    at = torch.bucketize(place.detach().contiguous(), place.new_tensor(edges), right=True) - 1
     inside = torch.nonzero((at >= 0) & (at < bins)).squeeze(1)
     of_bins = Groups((groups.owner * bins + at).index_select(0, inside), count)
     total = of_bins.sum(value.index_select(0, inside))

@@ -45,9 +45,14 @@ class Conditions(SumOfTargets):
             raise checks.input_error("Conditions.terms", self.terms, rule, hint)
         names = tuple(terms[0][0]) if isinstance(terms[0][0], Mapping) else ()
         for k, (given, part) in enumerate(terms):
-            if not isinstance(given, Mapping) or not given or set(given) != set(names):
-                rule = "numbers by name, of the same names in each condition"
-                raise checks.input_error(f"Conditions.terms[{k}]", given, rule)
+            if not isinstance(given, Mapping) or not given:
+                raise checks.input_error(f"Conditions.terms[{k}]", given, "numbers by name")
+            if set(given) != set(names):
+                here, first = (", ".join(map(repr, sorted(x))) for x in (given, names))
+                raise tf.InputError(
+                    f"Conditions.terms[{k}] names {here}, and Conditions.terms[0] names {first}:"
+                    " each condition must name the same arguments of the scene."
+                )
             for name, value in given.items():
                 checks.number(f"Conditions.terms[{k}]: {name}", value)
             of_colonies("Conditions", part)

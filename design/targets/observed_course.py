@@ -351,6 +351,10 @@ def _measured(
         known = {name: functions[name] for name in there}
         if known:
             frames.append(Measured(known, *parts, extinct=extinct, smooth=smooth, time=time))
+    if len(frames) < 2:
+        given = f"{len(moments)} times, of which {len(frames)} have a value"
+        hint = "Of one time, give Measured(…, time=…)."
+        raise checks.input_error(f"{call}: values", given, "of two times at least", hint)
     return frames
 
 

@@ -84,3 +84,10 @@ def test_only_what_could_measure_them_is_named():
     assert not extinct_words(measured(2.0, extinct=True), gone)
     assert not extinct_words(measured(2.0), ["at 0.5 h: n is not a number"])
     assert not extinct_words(Stripe("gfp", at=3.0, width=2.0), gone)
+
+
+def test_a_course_of_one_value_is_refused():
+    with pytest.raises(tf.InputError, match="2 times, of which 1 have a value.*Measured"):
+        ObservedCourse.of_measures(
+            {"n": cells}, times=(1.0, 2.0), values={"n": (6.0, float("nan"))}, spread={"n": 1.0}
+        )

@@ -22,15 +22,23 @@ def differences(was: list[str], now: list[str]) -> str:
     return "; ".join([*changed, *([whole] if whole else [])])
 
 
+# The name of an argument, or of an entry.
+NAMED = re.compile(r"=|[A-Za-z_]: ")
+
+
 def _changed(old: str, new: str) -> list[tuple[str, str]]:
     """The arguments in which two texts of one effect differ, "nothing" where one lacks them."""
     was, now = (re.split(r"(, |[()\[\]{}])", text) for text in (old, new))
     shown = lambda parts: repr(text) if (text := "".join(parts).strip(", ")) else "nothing"
-    return [
-        (shown(was[i:j]), shown(now[k:m]))
-        for kind, i, j, k, m in difflib.SequenceMatcher(None, was, now, False).get_opcodes()
-        if kind != "equal"
-    ]
+    found = []
+    for kind, i, j, k, m in difflib.SequenceMatcher(None, was, now, False).get_opcodes():
+        if kind == "equal":
+            continue
+        back = 0  # from the name of the argument on, where a part of its value differs
+        while i > back and j > i and m > k and not NAMED.search("".join(was[i - back : j])):
+            back += 1
+        found.append((shown(was[i - back : j]), shown(now[k - back : m])))
+    return found
 
 
 def list_kinds(kinds: dict[str, list[str]]) -> str:
