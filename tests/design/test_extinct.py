@@ -87,7 +87,7 @@ def test_only_what_could_measure_them_is_named():
 
 
 def test_a_course_of_one_value_is_refused():
-    with pytest.raises(tf.InputError, match="2 times, of which 1 have a value.*Measured"):
+    with pytest.raises(tf.InputError, match=r"2 times, of which 1 have a value.*Measured"):
         ObservedCourse.of_measures(
             {"n": cells}, times=(1.0, 2.0), values={"n": (6.0, float("nan"))}, spread={"n": 1.0}
         )
