@@ -302,6 +302,9 @@ class Transport:
         )
         wanted = tracked(*coefficients)
         stepper = prepare(made, dt, self.medium.method or choose(made))
+        if isinstance(stepper, Series) and stepper.solved is not None:
+            solved = dataclasses.replace(stepper.solved, compiled=self.compiled)
+            stepper = dataclasses.replace(stepper, solved=solved)
         most = float(stepper.exchanges.max()) if isinstance(stepper, Series) else 0.0
         if not most <= FARTHEST:
             raise checks.input_error(

@@ -192,11 +192,15 @@ def turned_euler(u, du, more, dmore, dloss, dt, pad, grid, times, operator, room
     )  # fmt: skip
     for i in range(u.size):
         x[pad + i], b[i] = u[i], u[i] + dt * more[i]
-    good = backward_euler(x, b, r, pad, grid, times, within, rounding, symmetric, most, spare)
+    good = backward_euler(
+        x, b, r, pad, grid, times, within, rounding, symmetric, most, spare, b[:0]
+    )
     for i in range(u.size):
         b[i] = du[i] + dt * (dmore[i] - dloss[i] * x[pad + i])
         x[pad + i] = du[i]
-    good &= backward_euler(x, b, r, pad, grid, times, within, rounding, symmetric, most, spare)
+    good &= backward_euler(
+        x, b, r, pad, grid, times, within, rounding, symmetric, most, spare, b[:0]
+    )
     for i in range(u.size):
         final[i] = mean[i] = x[pad + i]
     return good

@@ -27,6 +27,17 @@ def dot(a, b):
 
 
 @kernel
+def square(r, weight):
+    """|r|², of each voxel with its weight where there are some."""
+    if weight.size == 0:
+        return dot(r, r)
+    total = 0.0
+    for i in range(r.size):
+        total += (weight[i] * r[i]) ** 2
+    return total
+
+
+@kernel
 def product(v, out, pad, grid, many):
     """out = (I + many (I − P)) v for one grid; v: with padding, out without. grid: strides, stay,
     ups, downs, wrap_to, wrap_from, wraps as `transport.mix` takes them, of one colony."""
@@ -44,7 +55,7 @@ def _ratio(a, b):
 
 
 @kernel
-def conjugate_gradients(x, r, pad, grid, many, inverse, target, most, spare):
+def conjugate_gradients(x, r, pad, grid, many, inverse, target, most, spare, weight):
     """As `transport_iterative._conjugate_gradients`: x and r in place; x, spare: with padding;
     inverse: of the diagonal."""
     size = r.size
@@ -58,7 +69,7 @@ def conjugate_gradients(x, r, pad, grid, many, inverse, target, most, spare):
         for i in range(size):
             x[pad + i] += alpha * p[pad + i]
             r[i] -= alpha * q[i]
-        if not dot(r, r) > target:
+        if not square(r, weight) > target:
             return
         for i in range(size):
             q[i] = inverse[i] * r[i]
@@ -69,7 +80,7 @@ def conjugate_gradients(x, r, pad, grid, many, inverse, target, most, spare):
 
 
 @kernel
-def bicgstab(x, r, pad, grid, many, inverse, target, most, spare):
+def bicgstab(x, r, pad, grid, many, inverse, target, most, spare, weight):
     """As `transport_iterative._bicgstab`: x and r in place; x, spare: with padding; inverse: of the
     diagonal."""
     size = r.size
@@ -93,7 +104,7 @@ def bicgstab(x, r, pad, grid, many, inverse, target, most, spare):
         for i in range(size):
             x[pad + i] += omega * scaled[pad + i]
             r[i] = s[i] - omega * t[i]
-        if not dot(r, r) > target:
+        if not square(r, weight) > target:
             return
         new = dot(shadow, r)
         # a breakdown of the method: it restarts from the true residual
@@ -121,10 +132,13 @@ def _times(factor, b, x, r):
 
 
 @kernel
-def backward_euler(x, b, r, pad, grid, many, tolerance, rounding, symmetric, most, spare):
+def backward_euler(
+    x, b, r, pad, grid, many, tolerance, rounding, symmetric, most, spare, weight
+):  # fmt: skip
     """Solve (I + many (I − P)) x = b for one grid, from x, and leave the residual in r. Whether it
     converged. tolerance: of the residual over b. rounding: of the residual over x, times the
-    diagonal, whose inverse is left in spare[6]. spare: `SPARE` rows, 0 in their padding."""
+    diagonal, whose inverse is left in spare[6]. spare: `SPARE` rows, 0 in their padding. weight: of
+    each voxel in these norms; empty: 1."""
     inverse, stay, inner = spare[6, pad : pad + b.size], grid[1], x[pad : pad + b.size]
     small = _is_small(b, inner)
     if small:
@@ -139,15 +153,16 @@ def backward_euler(x, b, r, pad, grid, many, tolerance, rounding, symmetric, mos
         # cells take at a high rate hold little
         least = 0.0
         for i in range(b.size):
-            least += (inner[i] / inverse[i]) ** 2
-        target = max(tolerance**2 * dot(b, b), rounding**2 * least)
-        if trial == 3 or not dot(r, r) > target:
+            scale = weight[i] if weight.size > 0 else 1.0
+            least += (scale * inner[i] / inverse[i]) ** 2
+        target = max(tolerance**2 * square(b, weight), rounding**2 * least)
+        if trial == 3 or not square(r, weight) > target:
             break
         if symmetric:
-            conjugate_gradients(x, r, pad, grid, many, inverse, target, most, spare)
+            conjugate_gradients(x, r, pad, grid, many, inverse, target, most, spare, weight)
         else:
-            bicgstab(x, r, pad, grid, many, inverse, target, most, spare)
-    good = dot(r, r) <= 100 * target
+            bicgstab(x, r, pad, grid, many, inverse, target, most, spare, weight)
+    good = square(r, weight) <= 100 * target
     if small:
         _times(1 / LARGER, b, inner, r)
     return good
@@ -183,9 +198,36 @@ def solve(
             for i in range(size):
                 b[i] += more[i]
         good = backward_euler(
-            x, b, r, pad, grid, many[own], tolerance, rounding, symmetric, most, spare
+            x, b, r, pad, grid, many[own], tolerance, rounding, symmetric, most, spare, b[:0]
         )
         for i in range(size):
             # with its residual the change is what T makes of x: amount is conserved, but for the
             # rounding of λΔt exchanges
             out[starts[c] + i] = max(x[pad + i] + r[i], 0.0) if good else np.nan
+
+
+@kernel(entry=True)
+def solve_systems(
+    begin, end, strides, stay, ups, downs, wrap_to, wrap_from, wraps, many, weight, tolerance,
+    rounding, symmetric, most, right, x_of, good,
+):  # fmt: skip
+    """The solutions of the systems begin … end, whatever their signs: from x_of (b, voxels), in
+    place, and whether each converged, good (b,). right: (b, voxels). weight: (b or 1 or 0, voxels).
+    The others as of `solve`."""
+    size, pad = stay.shape[1], 0
+    for stride in strides:
+        pad = max(pad, stride)
+    wide = size + 2 * pad
+    mixed, x, spare = np.zeros(wide), np.zeros(wide), np.zeros((SPARE, wide))
+    b, r = np.empty(size), np.empty(size)
+    for c in range(begin, end):
+        own = c if stay.shape[0] > 1 else 0
+        grid = strides, stay[own], ups[own], downs[own], wrap_to, wrap_from, wraps[own], mixed
+        each = weight[c if weight.shape[0] > 1 else 0] if weight.shape[0] > 0 else b[:0]
+        for i in range(size):
+            x[pad + i], b[i] = x_of[c, i], right[c, i]
+        good[c] = backward_euler(
+            x, b, r, pad, grid, many[own], tolerance, rounding, symmetric, most, spare, each
+        )
+        for i in range(size):
+            x_of[c, i] = x[pad + i]

@@ -171,7 +171,9 @@ def carry_once(u, more, dt, pad, operator, room, far, least, settings):
     size = np.sqrt(dot(b, b))
     within = min(tolerance, HUNGER * least / size) if size > 0 else tolerance
     within = max(within, FINEST)
-    good = backward_euler(x, b, r, pad, grid, times, within, rounding, symmetric, most, spare)
+    good = backward_euler(
+        x, b, r, pad, grid, times, within, rounding, symmetric, most, spare, b[:0]
+    )
     for i in range(u.size):
         x[pad + i] = max(x[pad + i], 0.0)
     product(x, r, pad, grid, times)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchfilm.signals.compiled import may_run
 from torchfilm.signals.grid import Shape
-from torchfilm.signals.mixing import Mixing
+from torchfilm.signals.mixing import Mixing, mixing_arrays, packed
 from torchfilm.signals.transport_exponential import Exponential
 from torchfilm.signals.transport_iterative import MAX_ITERATIONS, ROUNDING, TOLERANCE
 from torchfilm.signals.transport_series import Series
@@ -153,7 +153,7 @@ def compiled_series(stepper: Series, shape: Shape) -> CompiledSeries | None:
         terms = torch.where(stepper.far, 0, terms)
     gained = _no_gain(shape) if stepper.gained is None else stepper.gained.detach().flatten(1)
     weights = stepper.weights.t().expand(count, -1)
-    arrays = (*mixing_arrays(stepper.mixing, shape, count), *_packed(weights, terms, gained))
+    arrays = (*mixing_arrays(stepper.mixing, shape, count), *packed(weights, terms, gained))
     solve, symmetric = None, True
     if stepper.far is not None and stepper.solved is not None:
         one, operator = stepper.solved, stepper.solved.operator
@@ -162,7 +162,7 @@ def compiled_series(stepper: Series, shape: Shape) -> CompiledSeries | None:
         more = _no_gain(shape)
         if operator.gain is not None:
             more = (one.dt * operator.gain.detach()).expand(-1, *shape).flatten(1)
-        solve = _packed(many, more)
+        solve = packed(many, more)
     return CompiledSeries(stepper, shape, arrays, solve, symmetric)
 
 
@@ -172,35 +172,3 @@ def _numbers(mixing: Mixing) -> list[Tensor]:
 
 def _no_gain(shape: Shape) -> Tensor:
     return torch.zeros(0, shape[0] * shape[1] * shape[2], dtype=torch.float64)
-
-
-def _packed(*given: Tensor) -> tuple[np.ndarray, ...]:
-    return tuple(np.ascontiguousarray(x.numpy()) for x in given)
-
-
-def mixing_arrays(mixing: Mixing, shape: Shape, count: int) -> tuple[np.ndarray, ...]:
-    """strides, stay, ups, downs, wrap_to, wrap_from and wraps of P, as `kernels.transport.mix`
-    takes them, of `count` colonies or 1."""
-    number = torch.arange(shape[0] * shape[1] * shape[2]).view(shape)
-    whole = lambda x: x.detach().expand(count, *shape).flatten(1).clone()
-    ups: list[Tensor] = []
-    downs: list[Tensor] = []
-    to, source, parts = [], [], []
-    for dim, up, down in mixing.gains:
-        for part, shift, face, kept in ((up, 1, 0, ups), (down, -1, -1, downs)):
-            at = number.select(dim - 1, face).reshape(-1)
-            made = whole(part)
-            to.append(at)
-            source.append(torch.roll(number, shift, dim - 1).select(dim - 1, face).reshape(-1))
-            parts.append(made[:, at])
-            made[:, at] = 0.0
-            kept.append(made)
-    nothing = torch.zeros(count, 0, number.numel(), dtype=torch.float64)
-    joined = lambda x: torch.stack(x, 1) if x else nothing
-    wraps = torch.cat(parts, 1) if parts else nothing[:, 0:0, 0]
-    there = (wraps > 0).any(0)  # elsewhere no face is periodic
-    places = [torch.cat(x)[there] if x else number[:0, 0, 0] for x in (to, source)]
-    strides = np.array([number.stride(dim - 1) for dim, _, _ in mixing.gains], np.int64)
-    return strides, *_packed(
-        whole(mixing.stay), joined(ups), joined(downs), *places, wraps[:, there]
-    )  # fmt: skip

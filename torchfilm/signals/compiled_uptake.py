@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from torchfilm.signals.compiled import may_run
-from torchfilm.signals.compiled_transport import mixing_arrays
 from torchfilm.signals.grid import Grid, GridBatch, Shape
-from torchfilm.signals.mixing import mixing_of
+from torchfilm.signals.mixing import mixing_arrays, mixing_of
 from torchfilm.signals.transport_iterative import MAX_ITERATIONS, ROUNDING, TOLERANCE
 from torchfilm.signals.transport_operator import Operator
 from torchfilm.signals.transport_series import ABOVE, CUT

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.signals.grid import Shape
 from torchfilm.signals.transport_operator import Operator
 
 
@@ -49,3 +51,36 @@ def mixing_of(operator: Operator, rate: Tensor) -> Mixing:
             up, down = up * inner.reshape(shape), down * inner.flip(0).reshape(shape)
         gains.append((dim, up, down))
     return Mixing(1 - operator.loss / rate, tuple(gains))
+
+
+def packed(*given: Tensor) -> tuple[np.ndarray, ...]:
+    """As contiguous arrays."""
+    return tuple(np.ascontiguousarray(x.numpy()) for x in given)
+
+
+def mixing_arrays(mixing: Mixing, shape: Shape, count: int) -> tuple[np.ndarray, ...]:
+    """strides, stay, ups, downs, wrap_to, wrap_from and wraps of P, as `kernels.transport.mix`
+    takes them, of `count` colonies or 1."""
+    number = torch.arange(shape[0] * shape[1] * shape[2]).view(shape)
+    whole = lambda x: x.detach().expand(count, *shape).flatten(1).clone()
+    ups: list[Tensor] = []
+    downs: list[Tensor] = []
+    to, source, parts = [], [], []
+    for dim, up, down in mixing.gains:
+        for part, shift, face, kept in ((up, 1, 0, ups), (down, -1, -1, downs)):
+            at = number.select(dim - 1, face).reshape(-1)
+            made = whole(part)
+            to.append(at)
+            source.append(torch.roll(number, shift, dim - 1).select(dim - 1, face).reshape(-1))
+            parts.append(made[:, at])
+            made[:, at] = 0.0
+            kept.append(made)
+    nothing = torch.zeros(count, 0, number.numel(), dtype=torch.float64)
+    joined = lambda x: torch.stack(x, 1) if x else nothing
+    wraps = torch.cat(parts, 1) if parts else nothing[:, 0:0, 0]
+    there = (wraps > 0).any(0)  # elsewhere no face is periodic
+    places = [torch.cat(x)[there] if x else number[:0, 0, 0] for x in (to, source)]
+    strides = np.array([number.stride(dim - 1) for dim, _, _ in mixing.gains], np.int64)
+    return strides, *packed(
+        whole(mixing.stay), joined(ups), joined(downs), *places, wraps[:, there]
+    )  # fmt: skip

@@ -17,6 +17,7 @@ from functools import cached_property, lru_cache
 import torch
 from torch import Tensor
 
+from torchfilm.signals.compiled_systems import Systems, may_solve
 from torchfilm.signals.transport_operator import Operator, apply
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
@@ -61,18 +62,6 @@ def prepare_euler(operator: Operator, dt: float) -> Euler:
 
 
 @dataclass(frozen=True, eq=False)
-class TransportSolveReport:
-    """What a solve did in each colony; every field is (B,).
-
-    iterations: of the Krylov method. residual: the true relative residual. converged: bool.
-    """
-
-    iterations: Tensor
-    residual: Tensor
-    converged: Tensor
-
-
-@dataclass(frozen=True, eq=False)
 class Unsplit:
     """u ↦ (I − θΔt T)⁻¹ [(I + (1 − θ)Δt T) u + Δt gain], each colony converged by itself.
 
@@ -84,6 +73,30 @@ class Unsplit:
     operator: Operator
     dt: float
     theta: float
+    compiled: bool = False
+
+    @cached_property
+    def _systems(self) -> dict[bool, Systems]:
+        return {}
+
+    def _solved(
+        self, apply: Map, b: Tensor, start: Tensor, *, transposed: bool = False,
+        weight: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """The solution of A x = b, or of Aᵀ x = b, which `apply` makes of x, and whether that of
+        each colony converged, (B,). Without derivatives."""
+        if self.by_kernels:
+            if transposed not in self._systems:
+                part = self.theta * self.dt
+                self._systems[transposed] = Systems.of(self.operator, part, transposed)
+            limits = TOLERANCE, ROUNDING, MAX_ITERATIONS
+            return self._systems[transposed].solved(b, start, weight, limits)
+        given = self.operator.symmetric, self.rounding, self.inverse, weight
+        return krylov(apply, b, start, *given)
+
+    @property
+    def by_kernels(self) -> bool:
+        return self.compiled and may_solve(self.operator)
 
     @cached_property
     def inverse(self) -> Tensor:
@@ -101,21 +114,16 @@ class Unsplit:
 
     def step_and_mean(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """As `step`; and the field by whose exchange u has changed, to rounding."""
-        out, residual, report = self._solve(u)
+        out, residual, converged = self._solve(u)
         # the exact solution of backward Euler has nothing below 0
         mean = out - residual
         out = out.clamp(min=0.0) if self.theta == 1 else out
-        good = report.converged.reshape(-1, 1, 1, 1)
+        good = converged.reshape(-1, 1, 1, 1)
         out, mean = torch.where(good, out, torch.nan), torch.where(good, mean, torch.nan)
         return out.to(u.dtype), mean.to(u.dtype)
 
-    def solve(self, u: Tensor) -> tuple[Tensor, TransportSolveReport]:
-        """u one step later, as far as the solve came, and its report."""
-        out, _, report = self._solve(u)
-        return out.to(u.dtype), report
-
-    def _solve(self, u: Tensor) -> tuple[Tensor, Tensor, TransportSolveReport]:
-        """The solution and what its last correction was, float64, and the report."""
+    def _solve(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The solution and what its last correction was, float64, and which colonies converged."""
         wide = u.double()
         linear = lambda x: apply(self.operator, x, gain=False)
         left = lambda x: x - self.theta * self.dt * linear(x)
@@ -125,10 +133,7 @@ class Unsplit:
         with torch.no_grad():
             bare = lambda x: both(x)[0]
             still = lambda x: bare(left(x))
-            solved = lambda b, first: krylov(
-                still, b, first, self.operator.symmetric, self.rounding, self.inverse
-            )
-            x, report = solved(bare(right), bare(wide))
+            x, converged = self._solved(still, bare(right), bare(wide))
             x = x.clamp(min=0.0) if self.theta == 1 else x
             # the change is then what T makes of x, which conserves amount to rounding
             residual = bare(right) - still(x)
@@ -141,13 +146,13 @@ class Unsplit:
             at, x = x, x + residual
             moved = both(right - left(at))[1]
             if moved is not None:  # x' = A⁻¹ (b' − A' x)
-                turned, _ = solved(moved, torch.zeros_like(x))
-                return with_tangent(x, turned), residual, report
+                turned, _ = self._solved(still, moved, torch.zeros_like(x))
+                return with_tangent(x, turned), residual, converged
         if torch.is_grad_enabled():
             remainder = right - left(at)
             if remainder.requires_grad:
                 x = _KrylovAdjoint.apply(remainder, x, left, self)
-        return x, residual, report
+        return x, residual, converged
 
 
 class _KrylovAdjoint(torch.autograd.Function):
@@ -166,7 +171,7 @@ class _KrylovAdjoint(torch.autograd.Function):
         refuse_second("a solve of transport")
         (forward, of), _ = kept(ctx)
         left, symmetric = forward, of.operator.symmetric
-        if not symmetric:
+        if not symmetric and not of.by_kernels:
             with torch.enable_grad():
                 at = torch.zeros_like(grad, requires_grad=True)
                 value = forward(at)
@@ -178,15 +183,10 @@ class _KrylovAdjoint(torch.autograd.Function):
             first = torch.zeros_like(grad)
             # where next to nothing is left, losses may depend on it a million times as strongly:
             # the residual there is not one of other voxels
-            found, report = krylov(
-                left, grad, first, symmetric, of.rounding, of.inverse, weight=of.inverse
+            found, converged = of._solved(
+                left, grad, first, transposed=not symmetric, weight=of.inverse
             )
-        return (
-            torch.where(report.converged.reshape(-1, 1, 1, 1), found, torch.nan),
-            None,
-            None,
-            None,
-        )
+        return (torch.where(converged.reshape(-1, 1, 1, 1), found, torch.nan), None, None, None)
 
 
 def prepare_crank_nicolson(operator: Operator, dt: float) -> Unsplit:
@@ -194,9 +194,9 @@ def prepare_crank_nicolson(operator: Operator, dt: float) -> Unsplit:
     return Unsplit(operator, dt, 0.5)
 
 
-def prepare_backward_euler(operator: Operator, dt: float) -> Unsplit:
-    """A step of `dt` hours."""
-    return Unsplit(operator, dt, 1.0)
+def prepare_backward_euler(operator: Operator, dt: float, *, compiled: bool = False) -> Unsplit:
+    """A step of `dt` hours. compiled: whether kernels may solve."""
+    return Unsplit(operator, dt, 1.0, compiled)
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
@@ -219,8 +219,9 @@ def _ratio(a: Tensor, b: Tensor) -> Tensor:
 def krylov(
     apply: Map, b: Tensor, start: Tensor, symmetric: bool, rounding: Tensor, inverse: Tensor,
     weight: Tensor | None = None,
-) -> tuple[Tensor, TransportSolveReport]:  # fmt: skip
-    """Solve A x = b, (B, nx, ny, nz), in float64, one system per colony, each until it converges.
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """The solution of A x = b, (B, nx, ny, nz), in float64, and which converged, (B,) bool: one
+    system per colony, each until it does.
 
     The residual is at most TOLERANCE of b, or its `rounding`, of the shape of b or of one, of x.
     inverse: of the diagonal of A. weight: of each voxel in these norms; by default 1. No gradient.
@@ -230,7 +231,7 @@ def krylov(
     b, start = b * up, start * up
     norm = lambda x: _dot(x, x) if weight is None else _dot(weight * x, weight * x)
     size = norm(b)
-    x, iterations = start.clone(), torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
+    x = start.clone()
     # restarts from the true residual correct the rounding errors of the recurred one
     for _ in range(3):
         r = b - apply(x)
@@ -239,41 +240,36 @@ def krylov(
         if not bool(going.any()):
             break
         method = _conjugate_gradients if symmetric else _bicgstab
-        x, spent = method(apply, x, r, inverse, going, norm, target)
-        iterations += spent
+        x = method(apply, x, r, inverse, going, norm, target)
     r = b - apply(x)
     target = torch.maximum(TOLERANCE**2 * size, norm(rounding * x))
-    residual = _ratio(norm(r), size).sqrt().reshape(-1)
     # a right-hand side of zero has the solution zero; a NaN never converges
-    return x / up, TransportSolveReport(iterations, residual, (norm(r) <= 100 * target).reshape(-1))
+    return x / up, (norm(r) <= 100 * target).reshape(-1)
 
 
 def _conjugate_gradients(
     apply: Map, x: Tensor, r: Tensor, inverse: Tensor, going: Tensor, norm: Map, target: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Returns x and the iterations of each colony, (B,)."""
-    spent = torch.zeros(x.shape[0], dtype=torch.int64, device=x.device)
+) -> Tensor:
+    """The solution, from x and its residual r."""
     p = inverse * r
     rz = _dot(p, r)
     for _ in range(MAX_ITERATIONS):
         q = apply(p)
         alpha = torch.where(going, _ratio(rz, _dot(p, q)), 0.0)
         x, r = torch.addcmul(x, alpha, p), torch.addcmul(r, alpha, q, value=-1.0)
-        spent += going.reshape(-1)
         going = going & (norm(r) > target)
         if not bool(going.any()):
             break
         z = inverse * r
         new = _dot(z, r)
         p, rz = torch.addcmul(z, torch.where(going, _ratio(new, rz), 0.0), p), new
-    return x, spent
+    return x
 
 
 def _bicgstab(
     apply: Map, x: Tensor, r: Tensor, inverse: Tensor, going: Tensor, norm: Map, target: Tensor
-) -> tuple[Tensor, Tensor]:
-    """van der Vorst's stabilised bi-conjugate gradients; returns as `_conjugate_gradients`."""
-    spent = torch.zeros(x.shape[0], dtype=torch.int64, device=x.device)
+) -> Tensor:
+    """The same by van der Vorst's stabilised bi-conjugate gradients."""
     shadow, p, rho = r, r, _dot(r, r)
     for _ in range(MAX_ITERATIONS):
         scaled = inverse * p
@@ -285,7 +281,6 @@ def _bicgstab(
         omega = torch.where(going, _ratio(_dot(t, s), _dot(t, t)), 0.0)
         x = torch.addcmul(x, omega, scaled)
         r = torch.where(going, torch.addcmul(s, omega, t, value=-1.0), r)
-        spent += going.reshape(-1)
         going = going & (norm(r) > target)
         if not bool(going.any()):
             break
@@ -294,7 +289,7 @@ def _bicgstab(
         p, rho = torch.addcmul(r, beta, torch.addcmul(p, omega, v, value=-1.0)), new
         # a breakdown of the method: this colony restarts from its true residual
         going = going & (alpha != 0) & (omega != 0) & (new != 0)
-    return x, spent
+    return x
 
 
 def convolve(operator: Operator, u: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from torchfilm.signals.compiled_uptake import EVENTS, CompiledUptake, compiled_u
 from torchfilm.signals.grid import Shape
 from torchfilm.signals.mixing import mixing_of
 from torchfilm.signals.series_sums import sums
-from torchfilm.signals.transport_iterative import prepare_backward_euler
+from torchfilm.signals.transport_iterative import Unsplit, prepare_backward_euler
 from torchfilm.signals.transport_operator import Operator
 from torchfilm.signals.transport_series import ABOVE, CUT, poisson
 from torchfilm.tools.tangents import both
@@ -72,13 +72,16 @@ class UptakeTransport:
         over = rate * dt > EVENTS
         far = over if far is None else far | over
         if bool(far.all()):
-            return *prepare_backward_euler(operator, dt).step_and_mean(u), far
+            return *self._euler(operator, dt).step_and_mean(u), far
         end, mean = _series(operator, torch.where(far, torch.inf, rate), dt, u)
         if bool(far.any()):
-            solved, by = prepare_backward_euler(operator, dt).step_and_mean(u)
+            solved, by = self._euler(operator, dt).step_and_mean(u)
             there = far.reshape(-1, 1, 1, 1)
             end, mean = torch.where(there, solved, end), torch.where(there, by, mean)
         return end, mean, far
+
+    def _euler(self, operator: Operator, dt: float) -> Unsplit:
+        return prepare_backward_euler(operator, dt, compiled=self.may_compile)
 
 
 def _series(operator: Operator, rate: Tensor, dt: float, u: Tensor) -> tuple[Tensor, Tensor]:
