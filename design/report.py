@@ -291,7 +291,8 @@ def misses_constraints(target: Target, loss: np.ndarray | float) -> np.ndarray:
 
 def constrained(target: Target) -> bool:
     """Whether a target has constraints, or one of its parts."""
-    return isinstance(target, Constrained) or any(map(constrained, getattr(target, "parts", ())))
+    inner = (*getattr(target, "parts", ()), *filter(None, [getattr(target, "target", None)]))
+    return isinstance(target, Constrained) or any(map(constrained, inner))
 
 
 def shown_loss(target: Target, loss: float) -> str:

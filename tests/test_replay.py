@@ -404,5 +404,5 @@ def test_growth_by_a_network_counts_with_its_weights():
     with pytest.raises(tf.InputError, match="does not grow as the recording did"):
         tf.Replay(one.bind(), recording)
     nets[1].requires_grad_(True)
-    with pytest.raises(tf.InputError, match=r"weights of a network of controlled.*requires_grad_"):
+    with pytest.raises(tf.InputError, match=r"a tensor that controlled uses.*requires_grad_"):
         tf.GrowthRecording(two, streams=[0])

@@ -16,7 +16,7 @@ from torchfilm.resolver import FirstValue
 from torchfilm.rule_views import KNOWN_FIELDS, MEANS
 from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
-from torchfilm.tools.hashing import networks
+from torchfilm.tools.hashing import trained
 from torchfilm.tools.tangents import tracked
 from torchfilm.tools.warn_once import warn
 
@@ -264,10 +264,11 @@ def why_not_replayable(model: Model) -> str:
         if tracked(tensor):
             return f"a derivative by {path} is wanted, which recorded growth does not carry"
     for effect in (model.scene.effects[k] for k in model.recorded):
-        if tracked(*(w for net in networks(effect) for w in net.parameters())):
+        if tracked(*trained(effect)):
             return (
-                f"a derivative by the weights of a network of {effect.title} is wanted, which"
-                " recorded growth does not carry: net.requires_grad_(False) if it is not"
+                f"a derivative by a tensor that {effect.title} uses, such as a weight of a network,"
+                " is wanted, which recorded growth does not carry: requires_grad_(False) if it is"
+                " not"
             )
     return ""
 

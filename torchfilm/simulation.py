@@ -250,8 +250,8 @@ def rollout(
         with kept.steps() as again:
             if again and versions != [w._version for w in weights]:
                 raise checks.InputError(
-                    "a tensor that the scene uses, such as a weight of a network, changed between"
-                    " rollout and the gradient, which does its steps again: call backward before"
+                    "a tensor that the scene uses, such as a weight of a network, changed since"
+                    " rollout began, and the gradient does its steps again: call backward before"
                     " the step of an optimiser, or give rollout segment=None."
                 )
             return steps_from(begin, steps)

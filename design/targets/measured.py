@@ -224,7 +224,7 @@ def extinct_words(target: Target, reasons: Iterable[str]) -> list[str]:
 
 def _leaves_out_extinct(target: object) -> bool:
     parts = (*getattr(target, "parts", ()), *getattr(target, "frames", ()))
-    wrapped = (getattr(target, name, None) for name in ("conditions", "measured"))
+    wrapped = (getattr(target, name, None) for name in ("conditions", "measured", "target"))
     return getattr(target, "extinct", True) is False or any(
         map(_leaves_out_extinct, (*parts, *(x for x in wrapped if x is not None)))
     )

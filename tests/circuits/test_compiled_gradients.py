@@ -9,6 +9,7 @@ from traced import by
 
 import torchfilm as tf
 from torchfilm.circuits import compiled_gradients, rosenbrock
+from torchfilm.tools.tangents import forward_mode, tangent, with_tangent
 
 F64 = torch.float64
 CONSTANTS = {"k": 3.0, "cut": 0.7}
@@ -259,15 +260,35 @@ def test_the_derivative_is_not_that_of_the_operations():
     assert slope_of(lambda u, s, p, c: {"a": torch.where(p.k * u.a > 0.6, 1.0, 0.0) - u.a}) == 0.0
 
 
-def test_what_is_held_constant_is_so_either_way_to_write_it():
-    given = {"rtol": 1e-6, "backend": "compiled"}
-    assert slope_of(without_gradients, **given) == slope_of(detached, **given)
+def test_values_do_not_depend_on_whether_gradients_are_off(plain):
+    """The solver needs every derivative by species, whatever the user's code holds constant."""
+    fast = lambda u, s, p, c: {"a": 1e6 * (p.k - u.a), "b": 0.0 * u.b}
+    ends = [
+        tf.rollout(scene(x, {"k": 1.3}, backend="compiled").bind(dtype=F64), until=0.4).a
+        for x in (fast, torch.no_grad()(fast))
+    ]
+    assert torch.equal(*ends) and 1.2 < float(ends[0][0]) < 1.3
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_tangents_pass_where_gradients_are_off(backend):
+    """As torch's own do."""
+    found = []
+    for given in (without_gradients, lambda u, s, p, c: {"a": p.k + p.k * u.a - 2 * u.a}):
+        with forward_mode():
+            k = with_tangent(torch.tensor(1.3, dtype=F64), torch.ones((), dtype=F64))
+            model = scene(given, {"k": k}, backend=backend, rtol=1e-6).bind(dtype=F64)
+            end = tf.rollout(model, until=0.6, segment=None)
+            found.append(float(tangent(end.a)[0]))
+    assert found[0] == pytest.approx(found[1], rel=1e-6) and abs(found[0]) > 0.1
 
 
 def test_explain_says_whose_derivative_it_is():
     said = tf.explain(scene(stepped, {"k": 1.3}), seconds=0)
     assert "compiled functions of its equations; gradients by torch, since Step has a deriv" in said
-    assert "gradients by up to" in tf.explain(scene(without_gradients, {"k": 1.3}), seconds=0)
+    said = tf.explain(scene(without_gradients, {"k": 1.3}), seconds=0)
+    assert "gradients by torch, since gradients are off in parts of it" in said
+    assert "gradients by up to 64" in tf.explain(scene(detached, {"k": 1.3}), seconds=0)
 
 
 def by_energy(u, s, p, cell):

@@ -7,7 +7,18 @@ import warnings
 import pytest
 
 import torchfilm as tf
-from design import Conditions, Measured, ObservedCourse, Parameter, Search, Stripe, infer
+from design import (
+    Conditions,
+    Constrained,
+    Lasting,
+    Measured,
+    ObservedCourse,
+    Parameter,
+    Search,
+    Stripe,
+    infer,
+)
+from design.report import constrained
 from design.targets.measured import extinct_words
 
 UNTIL = 1.5
@@ -51,6 +62,16 @@ def test_what_a_colony_without_cells_reaches_is_warned_of(wanted, spread, is_sai
     assert said_of(measured(wanted, spread, extinct=True)) == ""
 
 
+def test_a_measure_that_is_no_number_without_cells_reaches_nothing():
+    assert said_of(measured((-1.0, 1.0), function=lambda s: 0.0 / s.counts.double())) == ""
+
+
+def test_constraints_are_found_inside():
+    strict = Constrained(measured(2.0), at_most={"n": 5.0})
+    assert constrained(strict) and constrained(Lasting(strict, since=0.5))
+    assert not constrained(Lasting(measured(2.0), since=0.5))
+
+
 def test_a_function_that_takes_no_empty_state_is_let_be():
     assert said_of(measured(0.0, function=first_length)) == ""
 
@@ -81,6 +102,7 @@ def test_only_what_could_measure_them_is_named():
     gone = ["no cells remain at 0.5 h"]
     course = ObservedCourse([measured(1.0, time=0.5), measured(2.0, time=1.0)])
     assert extinct_words(measured(2.0), gone) and extinct_words(course, gone)
+    assert extinct_words(Lasting(measured(2.0), since=0.5), gone)
     assert not extinct_words(measured(2.0, extinct=True), gone)
     assert not extinct_words(measured(2.0), ["at 0.5 h: n is not a number"])
     assert not extinct_words(Stripe("gfp", at=3.0, width=2.0), gone)

@@ -288,10 +288,44 @@ def test_gradients_pass_several_grids_and_a_tangent_beside_goes_by_torch():
         assert float(tangent(carried).detach().min()) > 0
 
 
-def test_gradients_through_steps_that_are_solved_go_through_torch():
-    op, *_ = operator_of((6, 5, 1), "mixed", FLOWS[1])
-    stepper = prepare(op, 40 * MOST, "series")
-    u = torch.rand(1, 6, 5, 1, dtype=torch.float64).requires_grad_()
-    slopes = [torch.autograd.grad(f(u).square().sum(), u)[0] for f in (
-        lambda u: by_kernel(stepper, u), stepper.step)]  # fmt: skip
-    assert torch.allclose(*slopes, rtol=1e-12) and float(slopes[0].abs().max()) > 0
+def of_colonies(diffusion, boundary, dtype=torch.float64):
+    return build_operator(
+        (6, 5, 1), (1.0, 1.0, 1.0), diffusion=torch.tensor(diffusion, dtype=torch.float64),
+        velocity=(2.0, 0.5, 0.0), decay=0.1, boundary=boundary, colonies=len(diffusion),
+        dtype=dtype,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("faces", BOUNDARIES)
+def test_gradients_through_steps_that_are_solved(faces):
+    op = of_colonies([1e4, 1.0, 3e4], BOUNDARIES[faces])
+    stepper = prepare(op, 1.0, "series")
+    assert stepper.far.tolist() == [True, False, True]
+    draw = torch.Generator().manual_seed(1)
+    u, weight = torch.randn(2, 3, 6, 5, 1, dtype=torch.float64, generator=draw)
+    u = u.abs().requires_grad_()
+    slopes = [
+        torch.autograd.grad((f(u) * weight).sum(), u)[0]
+        for f in (lambda u: by_kernel(stepper, u), stepper.step)
+    ]
+    assert torch.allclose(*slopes, rtol=1e-7, atol=1e-9) and float(slopes[0].abs().max()) > 0
+    (slope,) = torch.autograd.grad(by_kernel(stepper, u).square().sum(), u)
+    with pytest.raises(RuntimeError, match="no second derivatives through a solve of transport"):
+        torch.autograd.grad(by_kernel(stepper, u).square().sum(), u, create_graph=True)
+    assert slope.shape == u.shape
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_of_a_colony_have_the_same_bits_beside_one_that_is_solved(dtype):
+    draw = torch.Generator().manual_seed(1)
+    values = torch.rand(30, dtype=dtype, generator=draw)
+
+    def found(*diffusion):
+        op = of_colonies(diffusion, BOUNDARIES["periodic"], dtype)
+        u = values.repeat(len(diffusion)).requires_grad_()
+        carrier = Carrier(prepare(op, 0.7, "series"), (6, 5, 1))
+        out = carry(grid_of(*[(6, 5, 1)] * len(diffusion)), [carrier], u)[:30]
+        return out.detach(), torch.autograd.grad(out.square().sum(), u)[0][:30]
+
+    alone, beside = found(3.0), found(3.0, 1e5)
+    assert all(torch.equal(a, b) for a, b in zip(alone, beside, strict=True))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import numpy as np
 import pytest
 import torch
@@ -102,6 +104,19 @@ def test_terms_backwards():
                     expected.append(mixing.of(expected[-1]) + gain)
             assert len(found) == count
             assert all(torch.equal(a, b) for a, b in zip(found[::-1], expected, strict=True))
+
+
+def test_few_terms_are_held_at_once():
+    mixing, _, _, u = made()
+    kept: list[int] = []
+    with pytest.MonkeyPatch.context() as patch, torch.no_grad():
+        patch.setattr(series_sums, "KEPT", 0)
+        for term in series_sums._backwards(mixing, None, u, 400):
+            del term
+            kept.append(
+                sum(type(x) is torch.Tensor and x.shape == u.shape for x in gc.get_objects())
+            )
+    assert len(kept) == 400 and max(kept) - min(kept) < 60
 
 
 def test_the_transposed_mixing():

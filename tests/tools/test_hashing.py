@@ -207,3 +207,54 @@ def test_what_an_optimiser_may_change():
 
     found = {id(x) for x in trained(f, {"again": net})}
     assert found == {id(weight), *map(id, net.parameters())}
+
+
+def test_a_module_that_comes_again_counts_in_each_place():
+    a, b = torch.nn.Linear(2, 2), torch.nn.Linear(2, 2)
+    same, other = torch.nn.Sequential(a, b, a), torch.nn.Sequential(a, b, b)
+    assert digest(same) != digest(other)
+
+
+def test_buffers_count_and_those_that_change_while_running_do_not_for_files():
+    one, other = torch.nn.BatchNorm1d(3), torch.nn.BatchNorm1d(3)
+    other.running_mean += 1.0
+    assert digest(one) != digest(other)
+    assert digest_of_weights(one) == digest_of_weights(other)
+    assert digest_of_weights(one.eval()) != digest_of_weights(other.eval())
+
+
+@pytest.mark.parametrize("make", [Own, lambda: torch.nn.Linear(2, 2)])
+def test_the_mode_of_a_module_and_its_hooks_are_no_code(make):
+    net, other = (trained_one(make, 0) for _ in range(2))
+    other.eval().register_forward_hook(lambda *given: None)
+    assert digest_of_code(net) == digest_of_code(other)
+
+
+@pytest.mark.parametrize(
+    "net",
+    [
+        torch.nn.LazyLinear(3),
+        torch.nn.Linear(2, 2).bfloat16(),
+        torch.nn.Linear(2, 2, device="meta"),
+    ],
+)
+def test_modules_without_usual_numbers(net):
+    assert digest(net) == digest(net) and digest_of_weights(net) == digest_of_weights(net)
+    assert digest_of_code(net) and isinstance(trained(net), list)
+
+
+def test_networks_of_inference_mode_are_not_watched():
+    with torch.inference_mode():
+        net = torch.nn.Linear(2, 2)
+    assert trained(net, torch.nn.LazyLinear(3)) == []
+
+
+def test_what_a_class_holds_counts():
+    def made(step):
+        class Holding:
+            net = trained_one(lambda: torch.nn.Linear(1, 1), step)
+
+        return Holding()
+
+    assert digest(made(0)) == digest(made(0)) != digest(made(1))
+    assert len(networks(made(0))) == 1

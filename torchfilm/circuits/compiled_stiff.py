@@ -58,8 +58,8 @@ class CompiledStiff(Compiled):
         self, circuit: CircuitCells, start: Tensor, dt: float, rtol: float, atol: float
     ) -> tuple[Tensor, RosenbrockReport] | None:  # fmt: skip
         """As `rosenbrock.rodas3`, of the cells `circuit.rows`, with derivatives; None over no time,
-        where both kinds are wanted at once, for gradients by too many numbers, and where a user's
-        torch.autograd.Function has a derivative of its own."""
+        where both kinds are wanted at once, for gradients by too many numbers, and where
+        derivatives of the rates are not those of their operations."""
         if dt == 0:
             return None
         values = self.values(circuit, circuit.rows, pools(circuit, circuit.rows))

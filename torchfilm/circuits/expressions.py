@@ -65,8 +65,7 @@ def walk(roots: Iterable[Expression]) -> Iterator[Expression]:
 class Builder:
     """Makes expressions; equal ones are the same object."""
 
-    #: a torch.autograd.Function of the user's that the expressions contain, whose derivative is
-    #: not that of its operations; "" without one
+    #: why the derivatives of what was traced are not those of its operations; "" where they are
     own_derivative = ""
 
     def __init__(self) -> None:

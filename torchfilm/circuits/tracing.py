@@ -163,17 +163,19 @@ def users_code() -> Iterator[None]:
         _TRACING.reset(before)
 
 
-def _with_its_derivative(made: Expression, builder: Builder) -> Expression:
-    """The expression with the derivative that the user's code gives it."""
+def _note_derivatives(builder: Builder) -> None:
+    """Note in the builder where the user's code gives an operation another derivative than its
+    own."""
     if not _TRACING.get():
-        return made
+        return
+    if not torch.is_grad_enabled():
+        builder.own_derivative = "gradients are off in parts of it"
     frame: FrameType | None = sys._getframe(1)
     while frame is not None and frame.f_code.co_name != TRACING:
         if frame.f_code is _OF_A_FUNCTION:
-            builder.own_derivative = getattr(frame.f_locals.get("cls"), "__name__", "a function")
-            return made
+            name = getattr(frame.f_locals.get("cls"), "__name__", "a function")
+            builder.own_derivative = f"{name} has a derivative of its own"
         frame = frame.f_back
-    return made if torch.is_grad_enabled() else builder.make("detach", made)
 
 
 # Functions made of others, by name: as rate laws, and as circuits evaluate powers and their like.
@@ -208,8 +210,8 @@ def apply(op: str, *args: Any) -> Column:
             f"it calculates with whole numbers or truth values ({op}): write torch.where, or"
             f" .to(u.name.dtype){_place()}"
         )
-    made = _with_its_derivative(first.builder.make(op, *parts), first.builder)
-    return Column.of(made, first.builder, *kind_of(op, kinds))
+    _note_derivatives(first.builder)
+    return Column.of(first.builder.make(op, *parts), first.builder, *kind_of(op, kinds))
 
 
 # Numbers as a type; "full": as a column of that type, one value for each cell.

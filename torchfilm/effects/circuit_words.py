@@ -20,7 +20,7 @@ def methods_of(
     own_derivative: str,
 ) -> list[str]:  # fmt: skip
     """Lines on the method, on who computes it, and on the signals that take turns with it.
-    own_derivative: a torch.autograd.Function in the rates, or ""."""
+    own_derivative: why the derivatives of the rates are not those of their operations, or ""."""
     molecules = (
         f"{number_range(numbers(circuit.molecules_per_unit))} molecules in a unit of concentration"
         " × µm³; no gradient"
@@ -41,7 +41,7 @@ def methods_of(
     why = [f"computed by torch: {x}" for x in why_torch]
     gradients = "; where gradients are required by torch, with derivatives from them"
     if circuit.method == "rosenbrock" and own_derivative:
-        gradients = f"; gradients by torch, since {own_derivative} has a derivative of its own"
+        gradients = f"; gradients by torch, since {own_derivative}"
     elif circuit.method == "rosenbrock":
         gradients = f", gradients by up to {MOST_DIRECTIONS} numbers too"
     lines += why or [f"computed by compiled functions of its equations{gradients}"]

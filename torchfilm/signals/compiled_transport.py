@@ -116,13 +116,12 @@ class CompiledSeries:
         return replace(self, arrays=(*mixing, np.empty((0, gained.shape[1]), gained.dtype)))
 
     @cached_property
-    def adjoint(self) -> CompiledSeries | None:
-        """What takes gradients of the step's result to those of what it began with; None where
-        another method takes the long steps."""
-        if self.stepper.far is not None:
-            return None
-        turned = replace(self.stepper, mixing=self.stepper.mixing.transposed(), gained=None)
-        return compiled_series(turned, self.shape)
+    def adjoint(self) -> CompiledSeriesAdjoint | None:
+        """What takes gradients of the step's result to those of what it began with."""
+        own = self.stepper
+        near = replace(own, mixing=own.mixing.transposed(), gained=None, far=None, solved=None)
+        carried = compiled_series(near, self.shape)
+        return None if carried is None else CompiledSeriesAdjoint(own, carried)
 
     def step(self, values: Tensor, starts: np.ndarray, out: Tensor) -> None:
         """Put the grids that begin at `starts` of values (voxels,) into out, one step later."""
@@ -140,6 +139,30 @@ class CompiledSeries:
             self._solved(
                 starts.size, lambda begin, end: solve(begin, end, starts, *given, source, target)
             )
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledSeriesAdjoint:
+    """The transpose of a step's linear part. carried: of the colonies that take the series."""
+
+    stepper: Series
+    carried: CompiledSeries
+
+    def linear(self) -> CompiledSeriesAdjoint:
+        return self
+
+    def step(self, values: Tensor, starts: np.ndarray, out: Tensor) -> None:
+        """As `CompiledSeries.step`."""
+        self.carried.step(values, starts, out)
+        far, solved = self.stepper.far, self.stepper.solved
+        if far is None or solved is None:
+            return
+        there = far.expand(starts.size)
+        size = self.carried.arrays[1].shape[1]
+        rows = torch.from_numpy(starts).unsqueeze(1) + torch.arange(size)
+        back = torch.where(there.unsqueeze(1), values[rows].double(), 0.0)
+        found = solved.pulled(back.view(-1, *self.carried.shape)).flatten(1)
+        out[rows[there]] = found[there].to(out.dtype)
 
 
 def compiled_series(stepper: Series, shape: Shape) -> CompiledSeries | None:

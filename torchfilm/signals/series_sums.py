@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.signals.mixing import Mixing
-from torchfilm.tools.tangents import in_forward_mode
+from torchfilm.tools.tangents import in_forward_mode, may_be_checkpoint
 
 # Numbers of all terms up to which a backward pass keeps them, for others that may follow. A longer
 # series is gone through once more in a backward pass, and as many as the root of its terms held.
@@ -76,6 +76,7 @@ class _Sums(torch.autograd.Function):
     def forward(ctx, dims, rows: Tensor, u: Tensor, gain: Tensor | None, stay, *sides):
         mixing = _mixing(dims, stay, sides)
         ctx.dims, ctx.terms = dims, None
+        ctx.keeps = not may_be_checkpoint()  # or they would be kept where a checkpoint drops all
         ctx.save_for_backward(rows, u, gain, stay, *sides)
         return _by_terms(mixing, gain, rows, u)
 
@@ -114,7 +115,8 @@ class _Sums(torch.autograd.Function):
 
 def _terms(ctx, mixing: Mixing, gain: Tensor | None, u: Tensor, count: int) -> Iterator[Tensor]:
     """As `_backwards`; kept where they are few, as several backward passes may follow."""
-    if torch.is_grad_enabled() or count * u.numel() > KEPT:  # on: for second derivatives
+    for_second_derivatives = torch.is_grad_enabled()
+    if for_second_derivatives or not ctx.keeps or count * u.numel() > KEPT:
         return _backwards(mixing, gain, u, count)
     if ctx.terms is None:
         ctx.terms = list(_backwards(mixing, gain, u, count))

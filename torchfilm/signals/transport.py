@@ -40,7 +40,7 @@ from torchfilm.signals.transport_iterative import prepare_crank_nicolson, prepar
 from torchfilm.signals.transport_operator import Operator
 from torchfilm.signals.transport_series import Series, prepare_series
 from torchfilm.tools import checks, subnormals
-from torchfilm.tools.tangents import both, has_tangent, with_tangent
+from torchfilm.tools.tangents import both, has_tangent, refuse_second, with_tangent
 
 
 class Stepper(Protocol):
@@ -132,13 +132,17 @@ class _Carried(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, values: Tensor, grid: Grid, kernels, adjoints) -> Tensor:
-        ctx.given = grid, adjoints, kernels
+        ctx.given = grid, kernels, adjoints
         return _run(grid, kernels, values)
 
     @staticmethod
     def backward(ctx, back: Tensor):  # type: ignore[override]
-        grid, adjoints, kernels = ctx.given
+        grid, kernels, adjoints = ctx.given
+        if not torch.is_grad_enabled():
+            return _run(grid, adjoints, back), None, None, None
         linear = [kernel.linear() for kernel in kernels]
+        if None in linear:
+            refuse_second("a solve of transport")
         return _Carried.apply(back, grid, adjoints, linear), None, None, None
 
 

@@ -86,13 +86,24 @@ class Unsplit:
         """The solution of A x = b, or of Aᵀ x = b, which `apply` makes of x, and whether that of
         each colony converged, (B,). Without derivatives."""
         if self.by_kernels:
-            if transposed not in self._systems:
-                part = self.theta * self.dt
-                self._systems[transposed] = Systems.of(self.operator, part, transposed)
-            limits = TOLERANCE, ROUNDING, MAX_ITERATIONS
-            return self._systems[transposed].solved(b, start, weight, limits)
+            return self._by_kernels(b, start, transposed, weight)
         given = self.operator.symmetric, self.rounding, self.inverse, weight
         return krylov(apply, b, start, *given)
+
+    def _by_kernels(
+        self, b: Tensor, start: Tensor, transposed: bool, weight: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        if transposed not in self._systems:
+            part = self.theta * self.dt
+            self._systems[transposed] = Systems.of(self.operator, part, transposed)
+        limits = TOLERANCE, ROUNDING, MAX_ITERATIONS
+        return self._systems[transposed].solved(b, start, weight, limits)
+
+    def pulled(self, back: Tensor) -> Tensor:
+        """A⁻ᵀ back by kernels, (B, nx, ny, nz) float64: the gradient by what a step of backward
+        Euler began with. NaN where a solve did not converge."""
+        found, good = self._by_kernels(back, torch.zeros_like(back), True, self.inverse)
+        return torch.where(good.reshape(-1, 1, 1, 1), found, torch.nan)
 
     @property
     def by_kernels(self) -> bool:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.nn.parameter import is_lazy
 
 
 def without_addresses(text: str) -> str:
@@ -42,9 +43,12 @@ def digest_of_code(*things: Any) -> str:
 
 
 def digest_of_weights(*things: Any) -> str:
-    """A word for the weights and buffers of the networks that these use; "" without a network."""
-    found = [x.state_dict() for x in networks(*things)]
-    return digest(found) if found else ""
+    """A word for the weights of the networks that these use; "" without a network."""
+    modules = [x for net in networks(*things) for x in net.modules()]
+    # in training mode a module may change its buffers as it runs
+    buffers = [dict(x.named_buffers(recurse=False)) for x in modules if not x.training]
+    found = [dict(x.named_parameters(recurse=False)) for x in modules]
+    return digest(found, buffers) if found else ""
 
 
 def networks(*things: Any) -> list[torch.nn.Module]:
@@ -61,7 +65,7 @@ def trained(*things: Any) -> list[torch.Tensor]:
             found += thing.parameters()
         elif isinstance(thing, torch.Tensor) and thing.is_leaf and thing.requires_grad:
             found.append(thing)
-    return found
+    return [x for x in found if not (is_lazy(x) or x.is_inference())]
 
 
 def _objects(things: tuple[Any, ...]) -> Iterator[Any]:
@@ -95,7 +99,7 @@ class _Word:
 
     def _add(self, thing: Any, enclosing: set[int]) -> None:
         if isinstance(thing, torch.Tensor):
-            thing = thing.detach().cpu().numpy()
+            thing = _numbers_of(thing)
         if isinstance(thing, np.ndarray):
             if thing.dtype.kind == "f":
                 # a number from a file equals the written number, in any precision
@@ -171,26 +175,39 @@ def _parts(thing: Any, *, weights: bool) -> list[Any]:
         return about + (_inside(thing, weights) if isinstance(thing, torch.nn.Module) else [])
     else:
         held = getattr(thing, "__dict__", {}) | _slots(thing)
-        if isinstance(thing, torch.nn.Module) and not weights:
-            held = {n: x for n, x in held.items() if n not in WEIGHTS}
+        if isinstance(thing, torch.nn.Module):
+            held = {n: x for n, x in held.items() if n not in OF_MODULES}
+            held["inside"] = _inside(thing, weights)
         given = [x for name, value in held.items() for x in (name, value)]
     # a user's class also counts by its functions
     own = [c for c in kind.__mro__ if c.__module__.split(".")[0] not in OURS]
     return [
         kind.__qualname__,
         *given,
-        *(f for c in own for f in vars(c).values() if isinstance(f, FunctionType)),
+        *(x for c in own for x in vars(c).values() if isinstance(x, OF_CLASSES)),
     ]
 
 
-# What a torch.nn module keeps its numbers in.
-WEIGHTS = ("_parameters", "_buffers")
+# What counts of a user's class, besides the attributes of the object.
+OF_CLASSES = (FunctionType, torch.nn.Module, torch.Tensor)
+# What torch keeps in each module: its parts, and hooks and the like, which do not count.
+OF_MODULES = frozenset(vars(torch.nn.Module()))
 
 
 def _inside(module: torch.nn.Module, weights: bool) -> list[Any]:
-    """What counts of a module of torch's own, besides its repr."""
+    """The modules in a module, and its numbers."""
     numbers = [dict(module.named_parameters(recurse=False)), dict(module.named_buffers("", False))]
-    return [dict(module.named_children()), *(numbers if weights else [])]
+    # (named_children leaves out a module that comes again)
+    return [dict(module._modules.items()), *(numbers if weights else [])]
+
+
+def _numbers_of(value: torch.Tensor) -> Any:
+    """The numbers of a tensor as NumPy has them, or a text where it has none."""
+    if is_lazy(value) or value.is_meta:
+        return "no numbers"
+    value = value.detach()
+    value = value.dequantize() if value.is_quantized else value.to_dense()
+    return (value.double() if value.is_floating_point() else value).cpu().numpy()
 
 
 def _imported(text: str) -> str:

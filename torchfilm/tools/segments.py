@@ -13,9 +13,11 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from itertools import count
 from typing import Any
+from weakref import ref
 
 import torch
 from torch import Tensor
+from torch.autograd import Variable
 
 _NOW: ContextVar[tuple[Segment, bool] | None] = ContextVar("segment", default=None)
 
@@ -31,11 +33,18 @@ class Segment:
     def steps(self) -> Iterator[bool]:
         """Around the steps, each time; whether it is for a backward pass."""
         again, self._done = self._done, True
-        before = _NOW.set((self, again))
+        before, first = _NOW.set((self, again)), next(self._numbers)
         try:
             yield again
         finally:
             _NOW.reset(before)
+            if again:  # which may not reach all Functions
+                made = range(first, next(self._numbers))
+                Variable._execution_engine.queue_callback(lambda: self._drop(made))
+
+    def _drop(self, numbers: range) -> None:
+        for number in numbers:
+            self._things.pop(number, None)
 
     def put(self, things: Any) -> int:
         number = next(self._numbers)
@@ -61,7 +70,8 @@ def keep(ctx: Any, things: Any, *tensors: Tensor) -> None:
     now, number = _NOW.get(), -1
     ctx.things, ctx.segment = things, None
     if now is not None:
-        ctx.things, ctx.segment = None, now[0]
+        # weakly, since things may hold a graph, which holds this, and nothing would free them
+        ctx.things, ctx.segment = None, ref(now[0])
         number = now[0].put(things) if now[1] else -1
     ctx.save_for_backward(torch.tensor(number), *tensors)
 
@@ -69,5 +79,9 @@ def keep(ctx: Any, things: Any, *tensors: Tensor) -> None:
 def kept(ctx: Any) -> tuple[Any, tuple[Tensor, ...]]:
     """What `keep` was given, once in a backward pass: things, and tensors."""
     number, *tensors = ctx.saved_tensors
-    things = ctx.things if ctx.segment is None else ctx.segment.take(int(number))
+    things = ctx.things
+    if ctx.segment is not None:
+        segment = ctx.segment()
+        assert segment is not None  # the checkpoint holds it as long as there is a graph
+        things = segment.take(int(number))
     return things, tuple(tensors)
