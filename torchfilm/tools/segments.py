@@ -3,7 +3,8 @@ keeps the first state only.
 
 Torch's checkpoint drops the tensors that a Function saves, and gets them from doing the steps once
 more. What a Function keeps in other ways it would keep twice. So in a segment such things are kept
-in the second run only, under a number that the Function saves as a tensor.
+in the second run only, under a number that the Function saves as a tensor, until the backward pass
+has taken them, or ends.
 """
 
 from __future__ import annotations
