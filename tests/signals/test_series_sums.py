@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchfilm.signals import series_sums
+from torchfilm.signals import compiled_sums, series_sums
 from torchfilm.signals.mixing import Mixing
 from torchfilm.signals.series_sums import sums
 from torchfilm.signals.transport_series import poisson
@@ -41,13 +41,16 @@ def loss(found) -> torch.Tensor:
 FORMS = [{}, {"gain": False}, {"one_mixing": True}, {"colonies": 1}, {"dims": (2,)}, {"dims": ()}]
 
 
-@pytest.mark.parametrize("kept", [series_sums.KEPT, 0])
+@pytest.mark.parametrize("way", [series_sums.KEPT, 0, "kernels"])
 @pytest.mark.parametrize("form", FORMS)
-def test_gradients_are_those_of_every_term(form, kept, monkeypatch):
-    monkeypatch.setattr(series_sums, "KEPT", kept)
+def test_gradients_are_those_of_every_term(form, way, monkeypatch):
+    by_kernels = way == "kernels"
+    if not by_kernels:
+        monkeypatch.setattr(series_sums, "KEPT", way)
     given = made(**form)
-    ours, theirs = sums(*given), series_sums._by_terms(*given)
-    assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
+    ours, theirs = sums(*given, compiled=by_kernels), series_sums._by_terms(*given)
+    assert all(torch.allclose(a, b, rtol=1e-14) for a, b in zip(ours, theirs, strict=True))
+    assert by_kernels or all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
     assert ours[0].grad_fn is not None and "_Sums" in type(ours[0].grad_fn).__name__
     own = leaves(*given)
     found, expected = (torch.autograd.grad(loss(x), own) for x in (ours, theirs))
@@ -56,13 +59,14 @@ def test_gradients_are_those_of_every_term(form, kept, monkeypatch):
         assert torch.allclose(a, b, rtol=1e-12)
 
 
-def test_one_of_several_requires_a_gradient():
+@pytest.mark.parametrize("compiled", [False, True])
+def test_one_of_several_requires_a_gradient(compiled):
     for chosen in range(9):
         given = made()
         own = leaves(*given)
         for k, x in enumerate(own):
             x.requires_grad_(k == chosen)
-        found = torch.autograd.grad(loss(sums(*given)), own[chosen])[0]
+        found = torch.autograd.grad(loss(sums(*given, compiled=compiled)), own[chosen])[0]
         expected = torch.autograd.grad(loss(series_sums._by_terms(*given)), own[chosen])[0]
         assert torch.allclose(found, expected, rtol=1e-12)
     assert len(own) == 9
@@ -79,10 +83,11 @@ def test_the_end_alone_and_the_mean_alone():
         assert all(torch.allclose(a, b, rtol=1e-12) for a, b in zip(found, expected, strict=True))
 
 
-def test_several_backward_passes_and_second_derivatives():
+@pytest.mark.parametrize("compiled", [False, True])
+def test_several_backward_passes_and_second_derivatives(compiled):
     given = made()
     own = leaves(*given)
-    found = sums(*given)
+    found = sums(*given, compiled=compiled)
     first, again = (torch.autograd.grad(loss(found), own, retain_graph=True) for _ in range(2))
     assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
     bent = []
@@ -138,3 +143,39 @@ def test_many_directions_at_once():
     for k, direction in enumerate(directions):
         one = torch.autograd.grad(end, own, direction, retain_graph=True)
         assert all(torch.allclose(a[k], b) for a, b in zip(many, one, strict=True))
+
+
+def test_by_kernels_a_colony_has_the_same_bits_in_any_company():
+    mixing, gain, rows, u = made(colonies=3)
+    whole = sums(mixing, gain, rows, u, compiled=True)
+    slopes = torch.autograd.grad(loss(whole), (u, gain, mixing.stay))
+    for k in range(3):
+        part = lambda x, k=k: x[k : k + 1] if x.shape[0] > 1 else x
+        gains = tuple((d, part(a), part(b)) for d, a, b in mixing.gains)
+        alone = Mixing(part(mixing.stay), gains)
+        one = sums(alone, part(gain), [part(x.T).T for x in rows], part(u), compiled=True)
+        assert all(torch.equal(a, b[k : k + 1]) for a, b in zip(one, whole, strict=True))
+        weighted = sum(
+            (x * torch.linspace(0.1, 2.0, 3 * x.numel(), dtype=F64).view(3, *x.shape[1:])[k]).sum()
+            for x in one
+        )
+        found = torch.autograd.grad(weighted, (u, gain, mixing.stay))
+        assert all(torch.equal(a[k], b[k]) for a, b in zip(found, slopes, strict=True))
+
+
+def test_one_term_alone():
+    mixing, gain, _, u = made()
+    rows = torch.tensor([[[0.3, 0.7]]], dtype=F64)
+    for compiled in (False, True):
+        (end,) = sums(mixing, gain, rows, u, compiled=compiled)
+        slope, *none = torch.autograd.grad(end.sum(), (u, gain, mixing.stay), allow_unused=True)
+        assert torch.equal(slope, rows[0, 0].reshape(2, 1, 1, 1).expand_as(u))
+        assert all(x is None or not bool(x.any()) for x in none)
+
+
+def test_series_too_long_to_be_held_go_through_torch(monkeypatch):
+    monkeypatch.setattr(compiled_sums, "MOST_HELD", 10)
+    given = made()
+    assert not compiled_sums.may_add_up(given[-1], 5)
+    found = sums(*given, compiled=True)
+    assert all(torch.equal(a, b) for a, b in zip(found, series_sums._by_terms(*given), strict=True))

@@ -289,15 +289,14 @@ class Medium(Effect):
         coupled = coupled or {}
         assert state.layout is not None
         shape, spacing = state.layout.grid.shape[0].tolist(), state.layout.grid.spacing
-        voxels = (
-            f"{' × '.join(map(str, shape))} voxels of {' × '.join(f'{h:g}' for h in spacing)} µm"
-        )
+        wide = " × ".join(f"{h:g}" for h in spacing)
+        voxels = f"{' × '.join(map(str, shape))} voxels of {wide} µm"
         flat = shape[2] == 1 and self.depth is None and len(self.box[0]) == 2
         lines = [f"grid: {voxels} a colony" + (", as deep as a voxel is wide" if flat else "")]
-        wide = [h * (n > 1) for n, h in zip(shape, spacing, strict=True)]
-        finest = min(filter(None, wide), default=spacing[0])
-        strang = "half of transport before the cells, half after (Strang)"
+        widths = [h * (n > 1) for n, h in zip(shape, spacing, strict=True)]
+        finest = min(filter(None, widths), default=spacing[0])
         if len(coupled) < len(self.signals):
+            strang = "half of transport before the cells, half after (Strang)"
             lines.append(strang if self.halves else "cells, then transport (Lie)")
         if exchanged and self.steps > 1:
             names = ", ".join(sorted(exchanged))
@@ -306,7 +305,7 @@ class Medium(Effect):
         lines += [f"{n}: moved together with {coupled[n]}, see there" for n in sorted(coupled)]
         for name, signal in self.signals.items():
             lines += reach_of(name, signal, finest)
-            lines += smear_of(name, signal, self.flow_of(name), wide)
+            lines += smear_of(name, signal, self.flow_of(name), widths)
             if name in coupled:
                 continue
             whole = not self.halves or (name in exchanged and self.steps > 1)
@@ -321,7 +320,8 @@ class Medium(Effect):
                 )
             ratio = number_range(torch.as_tensor(signal.diffusion) * (dt / finest**2))
             who = self.backend_on(state.device) if method in COMPILED else "torch"
-            who += "; by torch where gradients by its numbers are required" * (who == "compiled")
+            if who == "compiled" and method == "exponential":
+                who += "; by torch where gradients by its numbers are required"
             lines.append(f"{name}: {method}, {order} ({why}), {who}; dt·K/h² = {ratio}")
             if found is None or name in found:
                 lines += self._cost_of_turns(name, dt, state, name in exchanged)

@@ -301,10 +301,8 @@ class Transport:
             *(x for axis in made.axes for x in (axis.up, axis.down, axis.low, axis.high)),
         )
         wanted = tracked(*coefficients)
-        stepper = prepare(made, dt, self.medium.method or choose(made))
-        if isinstance(stepper, Series) and stepper.solved is not None:
-            solved = dataclasses.replace(stepper.solved, compiled=self.compiled)
-            stepper = dataclasses.replace(stepper, solved=solved)
+        method = self.medium.method or choose(made)
+        stepper = prepare(made, dt, method, compiled=self.compiled)
         most = float(stepper.exchanges.max()) if isinstance(stepper, Series) else 0.0
         if not most <= FARTHEST:
             raise checks.input_error(

@@ -14,6 +14,8 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from torchfilm.signals import compiled_sums
+from torchfilm.signals.compiled_sums import may_add_up
 from torchfilm.signals.mixing import Mixing
 from torchfilm.tools.tangents import in_forward_mode, may_be_checkpoint
 
@@ -23,16 +25,18 @@ KEPT = 2**20
 
 
 def sums(
-    mixing: Mixing, gain: Tensor | None, rows: Sequence[Tensor], u: Tensor
-) -> tuple[Tensor, ...]:
+    mixing: Mixing, gain: Tensor | None, rows: Sequence[Tensor], u: Tensor, *,
+    compiled: bool = False,
+) -> tuple[Tensor, ...]:  # fmt: skip
     """The sum of each row, (b, nx, ny, nz). u: of that shape; gain: g, or None; rows: (terms, b or
-    1) each, constants."""
+    1) each, constants. compiled: whether kernels may do it where gradients are wanted."""
     sides = [x for _, *both in mixing.gains for x in both]
     values = [x for x in (u, gain, mixing.stay, *sides) if x is not None]
     if in_forward_mode() or not torch.is_grad_enabled() or not any(x.requires_grad for x in values):
         return _by_terms(mixing, gain, rows, u)
     dims = tuple(dim for dim, _, _ in mixing.gains)
-    return _Sums.apply(dims, torch.stack(tuple(rows)), u, gain, mixing.stay, *sides)
+    compiled = compiled and may_add_up(u, len(rows[0]))
+    return _Sums.apply(dims, compiled, torch.stack(tuple(rows)), u, gain, mixing.stay, *sides)
 
 
 def _by_terms(
@@ -73,44 +77,56 @@ class _Sums(torch.autograd.Function):
     what a voxel gets from the one below, and from the one above."""
 
     @staticmethod
-    def forward(ctx, dims, rows: Tensor, u: Tensor, gain: Tensor | None, stay, *sides):
+    def forward(ctx, dims, compiled, rows: Tensor, u: Tensor, gain: Tensor | None, stay, *sides):
         mixing = _mixing(dims, stay, sides)
-        ctx.dims, ctx.terms = dims, None
+        ctx.dims, ctx.compiled, ctx.terms = dims, compiled, None
         ctx.keeps = not may_be_checkpoint()  # or they would be kept where a checkpoint drops all
         ctx.save_for_backward(rows, u, gain, stay, *sides)
-        return _by_terms(mixing, gain, rows, u)
+        return (compiled_sums.add_up if compiled else _by_terms)(mixing, gain, rows, u)
 
     @staticmethod
     def backward(ctx, *of_sums: Tensor):  # type: ignore[override]
         rows, u, gain, stay, *sides = ctx.saved_tensors
-        mixing, last = _mixing(ctx.dims, stay, sides), rows.shape[1] - 1
-        wanted = ctx.needs_input_grad[3:]
-        found: list[Tensor | None] = [None] * len(wanted)
-
-        def add(k: int, value: Tensor) -> None:
-            before = found[k]
-            found[k] = value if before is None else before + value
-
-        pull = lambda k: reduce(torch.add, map(_weighted, rows[:, k], of_sums))
-        back, pulled = pull(last), mixing.transposed()
-        terms = _terms(ctx, mixing, gain, u, last) if last and any(wanted[1:]) else None
-        for k in range(last - 1, -1, -1):
-            if wanted[0]:
-                add(0, back)
-            if terms is not None:
-                term = next(terms)
-                if wanted[1]:
-                    add(1, back * term)
-                for n, dim in enumerate(ctx.dims):
-                    for side, shift in ((2 * n, 1), (2 * n + 1, -1)):
-                        if wanted[2 + side]:
-                            add(2 + side, back * torch.roll(term, shift, dim))
-            back = pulled.of(back) + pull(k)
+        mixing, wanted = _mixing(ctx.dims, stay, sides), ctx.needs_input_grad[4:]
+        if ctx.compiled and not torch.is_grad_enabled():
+            back, found = compiled_sums.pull(mixing, gain, rows, u, of_sums, wanted)
+        else:
+            back, found = _pulled(ctx, mixing, gain, rows, u, of_sums, wanted)
         own = [
-            None if x is None or value is None else value.sum_to_size(x.shape)
-            for x, value in zip((gain, stay, *sides), found, strict=True)
+            None if not some or value is None else value.sum_to_size(x.shape)
+            for some, x, value in zip(wanted, (gain, stay, *sides), found, strict=True)
         ]
-        return None, None, back.sum_to_size(u.shape), *own
+        return None, None, None, back.sum_to_size(u.shape), *own
+
+
+def _pulled(
+    ctx, mixing: Mixing, gain: Tensor | None, rows: Tensor, u: Tensor, of_sums: Sequence[Tensor],
+    wanted: Sequence[bool],
+) -> tuple[Tensor, list[Tensor | None]]:  # fmt: skip
+    """As `compiled_sums.pull`, by torch."""
+    found: list[Tensor | None] = [None] * len(wanted)
+    last = rows.shape[1] - 1
+
+    def add(k: int, value: Tensor) -> None:
+        before = found[k]
+        found[k] = value if before is None else before + value
+
+    pull = lambda k: reduce(torch.add, map(_weighted, rows[:, k], of_sums))
+    back, pulled = pull(last), mixing.transposed()
+    terms = _terms(ctx, mixing, gain, u, last) if last and any(wanted[1:]) else None
+    for k in range(last - 1, -1, -1):
+        if wanted[0]:
+            add(0, back)
+        if terms is not None:
+            term = next(terms)
+            if wanted[1]:
+                add(1, back * term)
+            for n, (dim, _, _) in enumerate(mixing.gains):
+                for side, shift in ((2 * n, 1), (2 * n + 1, -1)):
+                    if wanted[2 + side]:
+                        add(2 + side, back * torch.roll(term, shift, dim))
+        back = pulled.of(back) + pull(k)
+    return back, found
 
 
 def _terms(ctx, mixing: Mixing, gain: Tensor | None, u: Tensor, count: int) -> Iterator[Tensor]:

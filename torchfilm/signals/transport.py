@@ -77,11 +77,17 @@ def check_method(operator: Operator, method: str | None) -> None:
         check_separable(operator)
 
 
-def prepare(operator: Operator, dt: float, method: str | None = None) -> Stepper:
-    """A step of `dt` hours by `method`; default: the suitable one."""
+def prepare(
+    operator: Operator, dt: float, method: str | None = None, *, compiled: bool = False
+) -> Stepper:
+    """A step of `dt` hours by `method`; default: the suitable one. compiled: whether kernels may
+    compute the gradients of a series."""
     check_method(operator, method)
     dt = checks.number("dt", dt, above=0.0, most=math.inf)
-    return METHODS[choose(operator) if method is None else method](operator, dt)
+    method = choose(operator) if method is None else method
+    if method == "series":
+        return prepare_series(operator, dt, compiled=compiled)
+    return METHODS[method](operator, dt)
 
 
 @dataclass(frozen=True, eq=False)

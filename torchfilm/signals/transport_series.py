@@ -50,10 +50,11 @@ class Series:
     gained: Tensor | None
     far: Tensor | None
     solved: Unsplit | None
+    compiled: bool = False
 
     def step(self, u: Tensor) -> Tensor:
         """u (B, nx, ny, nz) one step later."""
-        (out,) = sums(self.mixing, None, [self.weights], u.double())
+        (out,) = sums(self.mixing, None, [self.weights], u.double(), compiled=self.compiled)
         out = (out if self.gained is None else out + self.gained).to(u.dtype)
         if self.far is None or self.solved is None:
             return out
@@ -67,8 +68,8 @@ class Series:
         return torch.where(self.weights > 0, number.unsqueeze(1), 0).amax(0).cpu().numpy()
 
 
-def prepare_series(operator: Operator, dt: float) -> Series:
-    """The series of a step of `dt` hours."""
+def prepare_series(operator: Operator, dt: float, *, compiled: bool = False) -> Series:
+    """The series of a step of `dt` hours. compiled: whether kernels may compute gradients."""
     fastest = operator.loss.detach().flatten(1).amax(1)
     rate = torch.where(fastest > 0, ABOVE * fastest, 1.0)
     mean = (rate * dt).cpu().numpy()
@@ -80,7 +81,7 @@ def prepare_series(operator: Operator, dt: float) -> Series:
     if operator.gain is not None:
         each = on_device(tails) / rate
         whole = operator.gain.expand(max(rate.numel(), operator.gain.shape[0]), *operator.shape)
-        (gained,) = sums(mixing, None, [each], whole)
+        (gained,) = sums(mixing, None, [each], whole, compiled=compiled)
     any_far = bool(far.any())
     return Series(
         mixing,
@@ -88,7 +89,8 @@ def prepare_series(operator: Operator, dt: float) -> Series:
         on_device(weights),
         gained,
         on_device(far) if any_far else None,
-        prepare_backward_euler(operator, dt) if any_far else None,
+        prepare_backward_euler(operator, dt, compiled=compiled) if any_far else None,
+        compiled,
     )
 
 

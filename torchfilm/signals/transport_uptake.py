@@ -73,7 +73,8 @@ class UptakeTransport:
         far = over if far is None else far | over
         if bool(far.all()):
             return *self._euler(operator, dt).step_and_mean(u), far
-        end, mean = _series(operator, torch.where(far, torch.inf, rate), dt, u)
+        rate = torch.where(far, torch.inf, rate)
+        end, mean = _series(operator, rate, dt, u, compiled=self.may_compile)
         if bool(far.any()):
             solved, by = self._euler(operator, dt).step_and_mean(u)
             there = far.reshape(-1, 1, 1, 1)
@@ -84,7 +85,9 @@ class UptakeTransport:
         return prepare_backward_euler(operator, dt, compiled=self.may_compile)
 
 
-def _series(operator: Operator, rate: Tensor, dt: float, u: Tensor) -> tuple[Tensor, Tensor]:
+def _series(
+    operator: Operator, rate: Tensor, dt: float, u: Tensor, *, compiled: bool
+) -> tuple[Tensor, Tensor]:
     """u at the end of dt hours, and its mean. rate: λ, (b,); where it is infinite u stays."""
     size, events = (-1, 1, 1, 1), torch.where(torch.isinf(rate), 0.0, rate * dt)
     cut = torch.finfo(operator.dtype).eps * CUT
@@ -92,5 +95,5 @@ def _series(operator: Operator, rate: Tensor, dt: float, u: Tensor) -> tuple[Ten
     weights, tails = both_weights
     mixing = mixing_of(operator, rate.reshape(size))
     gain = None if operator.gain is None else operator.gain / rate.reshape(size)
-    end, total = sums(mixing, gain, (weights, tails), u)
+    end, total = sums(mixing, gain, (weights, tails), u, compiled=compiled)
     return end, total / torch.where(events > 0, events, 1.0).reshape(size)
