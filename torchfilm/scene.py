@@ -222,7 +222,7 @@ class Scene(metaclass=checks.KnownKeywords):
         own = self.code
         if code is None or code[:2] != own[:2]:
             return ""
-        if code[2] != own[2]:
+        if code[2:3] != own[2:3]:
             return (
                 "a function of its effects was edited, or an object that such a function uses, or a"
                 " parameter with one value per colony"

@@ -67,7 +67,7 @@ class Unsplit:
 
     θ: 1 for backward Euler, 1/2 for Crank–Nicolson. The solve uses conjugate gradients, or BiCGStab
     where there is flow, scaled by the diagonal: cells may take from a few voxels a million times
-    what is there.
+    what is there. compiled: whether kernels may solve.
     """
 
     operator: Operator

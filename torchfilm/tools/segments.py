@@ -10,7 +10,7 @@ has taken them, or ends.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from itertools import count
 from typing import Any
@@ -41,7 +41,8 @@ class Segment:
             _NOW.reset(before)
             if again:  # which may not reach all Functions
                 made = range(first, next(self._numbers))
-                Variable._execution_engine.queue_callback(lambda: self._drop(made))
+                with suppress(RuntimeError):  # outside of a backward pass: who looks at a tensor
+                    Variable._execution_engine.queue_callback(lambda: self._drop(made))
 
     def _drop(self, numbers: range) -> None:
         for number in numbers:
