@@ -214,9 +214,7 @@ def greedy(u, s, p, cell):
 
 def test_cells_that_take_what_is_not_there_are_named():
     made = resting(medium(), tf.Circuit(greedy, species="ahl"), SIX)
-    # as the last part of a step begins with much or with next to nothing
-    named = "cells take more of a signal than there is|push a concentration below zero, 'out.ahl'"
-    with pytest.raises(tf.SimulationError, match=named):
+    with pytest.raises(tf.SimulationError, match="cells take more of a signal than there is"):
         for _ in tf.simulate(made, until=0.2):
             pass
 
@@ -435,7 +433,9 @@ def test_a_rate_that_does_not_fall_with_what_is_there_is_named(initial):
 
     circuit = tf.Circuit(takes, species="eaten", rate=200 * initial, atol=1e-3 * initial)
     made = resting(medium(1e5, decay=0.0, initial=initial), circuit, SIX)
-    with pytest.raises(tf.SimulationError, match="cells take more of a signal than there is"):
+    # as the last part of a step begins with much or with next to nothing
+    named = "cells take more of a signal than there is|push a concentration below zero, 'out.ahl'"
+    with pytest.raises(tf.SimulationError, match=named):
         for state in tf.simulate(made, made.bind(dtype=F64).start(), until=400 * DT, dt=DT):
             eaten = float((state.eaten * state.volume).sum())
             assert eaten <= initial * 32.0**2 * 4.0 * 1.001
