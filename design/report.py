@@ -14,7 +14,7 @@ from design.finals import FreshLosses
 from design.growing import FinishedColonies
 from design.parameters import Choice, Parameter, Space, Value, show_value
 from design.study import Study
-from design.targets.base import Target
+from design.targets.base import Target, inner_targets
 from design.targets.goals import Constrained, Goals
 from design.targets.lasting import Lasting
 from design.targets.measured import extinct_words
@@ -291,8 +291,7 @@ def misses_constraints(target: Target, loss: np.ndarray | float) -> np.ndarray:
 
 def constrained(target: Target) -> bool:
     """Whether a target has constraints, or one of its parts."""
-    inner = (*getattr(target, "parts", ()), *filter(None, [getattr(target, "target", None)]))
-    return isinstance(target, Constrained) or any(map(constrained, inner))
+    return isinstance(target, Constrained) or any(map(constrained, inner_targets(target)))
 
 
 def shown_loss(target: Target, loss: float) -> str:

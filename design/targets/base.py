@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -316,3 +316,10 @@ def species_names(name: str, given: object, count: int | None = None) -> tuple[s
     if len(set(given)) != len(given):
         raise checks.input_error(name, given, rule)
     return tuple(given)
+
+
+def inner_targets(target: object) -> tuple[Any, ...]:
+    """The targets that a target is made of, or data."""
+    several = (*getattr(target, "parts", ()), *getattr(target, "frames", ()))
+    one = (getattr(target, name, None) for name in ("target", "conditions", "measured"))
+    return (*several, *(x for x in one if x is not None))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import WORST, Target, ended_elsewhere, requiring_gradients
+from design.targets.base import WORST, Target, ended_elsewhere, inner_targets, requiring_gradients
 from torchfilm import checks
 
 Measure = Callable[[tf.State], Tensor]
@@ -223,8 +223,5 @@ def extinct_words(target: Target, reasons: Iterable[str]) -> list[str]:
 
 
 def _leaves_out_extinct(target: object) -> bool:
-    parts = (*getattr(target, "parts", ()), *getattr(target, "frames", ()))
-    wrapped = (getattr(target, name, None) for name in ("conditions", "measured", "target"))
-    return getattr(target, "extinct", True) is False or any(
-        map(_leaves_out_extinct, (*parts, *(x for x in wrapped if x is not None)))
-    )
+    inside = map(_leaves_out_extinct, inner_targets(target))
+    return getattr(target, "extinct", True) is False or any(inside)

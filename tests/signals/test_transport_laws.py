@@ -19,9 +19,9 @@ from torchfilm.signals.boundary_conditions import (
     Periodic,
     Robin,
 )
+from torchfilm.signals.mixing import ABOVE
 from torchfilm.signals.transport import METHODS, prepare
 from torchfilm.signals.transport_rates import build_operator
-from torchfilm.signals.transport_series import ABOVE
 
 face = st.one_of(
     st.just(NoFlux()),

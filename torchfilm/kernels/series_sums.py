@@ -6,15 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchfilm.kernels.compiling import kernel
-from torchfilm.kernels.transport import exchanged
-
-
-@kernel
-def padding_of(strides):
-    pad = 0
-    for stride in strides:
-        pad = max(pad, stride)
-    return pad
+from torchfilm.kernels.transport import exchanged, padding_of
 
 
 @kernel

@@ -145,6 +145,15 @@ def carry(begin, end, starts, shape, axes, factors, firsts, lasts, gained, value
 
 
 @kernel
+def padding_of(strides):
+    """How far a voxel's neighbours are from it, in a row of all voxels."""
+    pad = 0
+    for stride in strides:
+        pad = max(pad, stride)
+    return pad
+
+
+@kernel
 def exchanged(v, new, pad, strides, stay, ups, downs):
     """new = P v for one grid, but for what passes between opposite faces; v, new: (pad + voxels +
     pad,), 0 in the padding; stay: (voxels,), ups, downs: (axes, voxels), 0 at the faces."""
@@ -179,10 +188,7 @@ def mix(
     wrap_to through periodic faces. weights: (b or 1, terms), of which a colony has `terms`, none
     where it is carried by another method. gained: (b or 1 or 0, voxels).
     """
-    size = stay.shape[1]
-    pad = 0
-    for stride in strides:
-        pad = max(pad, stride)
+    size, pad = stay.shape[1], padding_of(strides)
     buffers, total = np.zeros((2, size + 2 * pad)), np.empty(size)
     for c in range(begin, end):
         own = c if stay.shape[0] > 1 else 0

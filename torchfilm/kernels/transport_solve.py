@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchfilm.kernels.compiling import kernel
-from torchfilm.kernels.transport import exchanged
+from torchfilm.kernels.transport import exchanged, padding_of
 
 # Rows that a solve works in.
 SPARE = 7
@@ -180,9 +180,7 @@ def solve(
     carries a colony. tolerance, rounding: as of `backward_euler`. gained: Δt × the gain, (b or 1 or
     0, voxels). most: iterations before a restart.
     """
-    size, pad = stay.shape[1], 0
-    for stride in strides:
-        pad = max(pad, stride)
+    size, pad = stay.shape[1], padding_of(strides)
     wide = size + 2 * pad
     mixed, x, spare = np.zeros(wide), np.zeros(wide), np.zeros((SPARE, wide))
     b, r = np.empty(size), np.empty(size)
@@ -214,9 +212,7 @@ def solve_systems(
     """The solutions of the systems begin … end, whatever their signs: from x_of (b, voxels), in
     place, and whether each converged, good (b,). right: (b, voxels). weight: (b or 1 or 0, voxels).
     The others as of `solve`."""
-    size, pad = stay.shape[1], 0
-    for stride in strides:
-        pad = max(pad, stride)
+    size, pad = stay.shape[1], padding_of(strides)
     wide = size + 2 * pad
     mixed, x, spare = np.zeros(wide), np.zeros(wide), np.zeros((SPARE, wide))
     b, r = np.empty(size), np.empty(size)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchfilm.kernels.compiling import kernel
-from torchfilm.kernels.transport import exchanged
+from torchfilm.kernels.transport import exchanged, padding_of
 from torchfilm.kernels.transport_solve import SPARE, backward_euler, dot, product
 
 # As in `tools.fixed_point`.
@@ -109,9 +109,7 @@ def series(u, pad, grid, weights, tails, used, gained, times, end, mean, spare):
 def room_for(size, strides, events):
     """What `carry_once` works in, for grids of so many voxels, and the padding. events: the most of
     a series."""
-    pad = 0
-    for stride in strides:
-        pad = max(pad, stride)
+    pad = padding_of(strides)
     terms = int(events + 10 * np.sqrt(events) + 31)
     fields, wider = np.empty((6, size)), np.zeros((2 + SPARE, size + 2 * pad))
     room = (

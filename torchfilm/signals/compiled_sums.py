@@ -70,10 +70,9 @@ def pull(
 
 def _arrays(mixing: Mixing, u: Tensor) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
     """The strides, and P as kernels take it."""
-    parts = [mixing.stay, *(x for _, *both in mixing.gains for x in both)]
+    shape: Any = tuple(u.shape[1:])
     with no_derivatives():
-        count = max(x.shape[0] for x in parts)
-        strides, *rest = mixing_arrays(mixing, tuple(u.shape[1:]), count)  # type: ignore[arg-type]
+        strides, *rest = mixing_arrays(mixing, shape, mixing.colonies)
     return strides, tuple(rest)
 
 

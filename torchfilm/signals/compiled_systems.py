@@ -9,15 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.signals.mixing import mixing_arrays, mixing_of, packed
+from torchfilm.signals.mixing import mixing_arrays, mixing_of, packed, rate_above
 from torchfilm.signals.transport_operator import Operator
 from torchfilm.tools import subnormals
 from torchfilm.tools.numba_calls import unavailable
 from torchfilm.tools.tangents import no_derivatives
 from torchfilm.tools.threads import Shared
-
-# λ over the greatest rate at which a voxel exchanges: any will do.
-ABOVE = 1.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,11 +31,10 @@ class Systems:
         with no_derivatives():
             # what voxels lose otherwise may be a million times as much: rounding would hide them
             exchanged = (operator.loss - operator.decay).flatten(1).amax(1)
-            rate = torch.where(exchanged > 0, ABOVE * exchanged, 1.0)
+            rate = rate_above(exchanged)
             mixing = mixing_of(operator, rate.reshape(-1, 1, 1, 1))
             mixing = mixing.transposed() if transposed else mixing
-            gains = [x for _, up, down in mixing.gains for x in (up, down)]
-            count = max(rate.numel(), *(x.shape[0] for x in [mixing.stay, *gains]))
+            count = max(rate.numel(), mixing.colonies)
             many = (part * rate).expand(count)
             arrays = mixing_arrays(mixing, operator.shape, count)
         return Systems((*arrays, *packed(many)), operator.symmetric, Shared())

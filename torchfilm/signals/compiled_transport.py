@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchfilm.signals.compiled import may_run
 from torchfilm.signals.grid import Shape
-from torchfilm.signals.mixing import Mixing, mixing_arrays, packed
+from torchfilm.signals.mixing import mixing_arrays, packed
 from torchfilm.signals.transport_exponential import Exponential
 from torchfilm.signals.transport_iterative import MAX_ITERATIONS, ROUNDING, TOLERANCE
 from torchfilm.signals.transport_series import Series
@@ -167,7 +167,7 @@ class CompiledSeriesAdjoint:
 
 def compiled_series(stepper: Series, shape: Shape) -> CompiledSeries | None:
     """The same step compiled, or None where kernels may not run it."""
-    given = _numbers(stepper.mixing) + ([] if stepper.gained is None else [stepper.gained])
+    given = stepper.mixing.numbers + ([] if stepper.gained is None else [stepper.gained])
     if not may_run(*given):
         return None
     count = max(stepper.weights.shape[1], *(x.shape[0] for x in given))
@@ -187,10 +187,6 @@ def compiled_series(stepper: Series, shape: Shape) -> CompiledSeries | None:
             more = (one.dt * operator.gain.detach()).expand(-1, *shape).flatten(1)
         solve = packed(many, more)
     return CompiledSeries(stepper, shape, arrays, solve, symmetric)
-
-
-def _numbers(mixing: Mixing) -> list[Tensor]:
-    return [mixing.stay, *(x for _, up, down in mixing.gains for x in (up, down))]
 
 
 def _no_gain(shape: Shape) -> Tensor:

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from torchfilm.signals.compiled import may_run
 from torchfilm.signals.grid import Grid, GridBatch, Shape
-from torchfilm.signals.mixing import mixing_arrays, mixing_of
+from torchfilm.signals.mixing import ABOVE, mixing_arrays, mixing_of, rate_above
 from torchfilm.signals.transport_iterative import MAX_ITERATIONS, ROUNDING, TOLERANCE
 from torchfilm.signals.transport_operator import Operator
-from torchfilm.signals.transport_series import ABOVE, CUT
+from torchfilm.signals.transport_series import CUT
 from torchfilm.tools import subnormals
 from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.tangents import both
@@ -53,10 +53,9 @@ def compiled_uptake(operator: Operator, shape: Shape) -> CompiledUptake | None:
     if not may_run(*numbers, *([] if gain is None else [gain])):
         return None
     fastest = operator.loss.flatten(1).amax(1)
-    rate = torch.where(fastest > 0, ABOVE * fastest, 1.0)
+    rate = rate_above(fastest)
     mixing = mixing_of(operator, rate.reshape(-1, 1, 1, 1))
-    gains = [x for _, up, down in mixing.gains for x in (up, down)]
-    count = max(rate.numel(), *(x.shape[0] for x in [mixing.stay, *gains]))
+    count = max(rate.numel(), mixing.colonies)
     none = torch.zeros(0, operator.loss[0].numel(), dtype=torch.float64)
     more = none if gain is None else gain.expand(-1, *shape).flatten(1)
     return CompiledUptake(

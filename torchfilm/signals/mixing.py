@@ -11,6 +11,9 @@ from torch import Tensor
 from torchfilm.signals.grid import Shape
 from torchfilm.signals.transport_operator import Operator
 
+# λ over the greatest loss rate: each voxel keeps a part of its content larger than all roundings.
+ABOVE = 1.01
+
 
 @dataclass(frozen=True, eq=False)
 class Mixing:
@@ -21,6 +24,15 @@ class Mixing:
 
     stay: Tensor
     gains: tuple[tuple[int, Tensor, Tensor], ...]
+
+    @property
+    def numbers(self) -> list[Tensor]:
+        return [self.stay, *(x for _, *both in self.gains for x in both)]
+
+    @property
+    def colonies(self) -> int:
+        """1 where all share it."""
+        return max(x.shape[0] for x in self.numbers)
 
     def of(self, v: Tensor) -> Tensor:
         """P v, for v (B, nx, ny, nz)."""
@@ -34,6 +46,11 @@ class Mixing:
         """Pᵀ: a voxel gets from each neighbour what P gives to it."""
         turn = lambda dim, up, down: (dim, torch.roll(down, 1, dim), torch.roll(up, -1, dim))
         return Mixing(self.stay, tuple(turn(*x) for x in self.gains))
+
+
+def rate_above(fastest: Tensor) -> Tensor:
+    """λ for the greatest loss rate of each colony."""
+    return torch.where(fastest > 0, ABOVE * fastest, 1.0)
 
 
 def mixing_of(operator: Operator, rate: Tensor) -> Mixing:

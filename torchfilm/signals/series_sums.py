@@ -30,13 +30,12 @@ def sums(
 ) -> tuple[Tensor, ...]:  # fmt: skip
     """The sum of each row, (b, nx, ny, nz). u: of that shape; gain: g, or None; rows: (terms, b or
     1) each, constants. compiled: whether kernels may do it where gradients are wanted."""
-    sides = [x for _, *both in mixing.gains for x in both]
-    values = [x for x in (u, gain, mixing.stay, *sides) if x is not None]
+    values = [x for x in (u, gain, *mixing.numbers) if x is not None]
     if in_forward_mode() or not torch.is_grad_enabled() or not any(x.requires_grad for x in values):
         return _by_terms(mixing, gain, rows, u)
     dims = tuple(dim for dim, _, _ in mixing.gains)
     compiled = compiled and may_add_up(u, len(rows[0]))
-    return _Sums.apply(dims, compiled, torch.stack(tuple(rows)), u, gain, mixing.stay, *sides)
+    return _Sums.apply(dims, compiled, torch.stack(tuple(rows)), u, gain, *mixing.numbers)
 
 
 def _by_terms(

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.signals.mixing import Mixing, mixing_of
+from torchfilm.signals.mixing import Mixing, mixing_of, rate_above
 from torchfilm.signals.series_sums import sums
 from torchfilm.signals.transport_iterative import Unsplit, prepare_backward_euler
 from torchfilm.signals.transport_operator import Operator
@@ -29,8 +29,6 @@ from torchfilm.signals.transport_operator import Operator
 MOST = 1000.0
 # More exchanges of a voxel in a step leave nothing but rounding of backward Euler's solve.
 FARTHEST = 1e12
-# λ over the greatest loss rate: each voxel keeps a part of its content larger than all roundings.
-ABOVE = 1.01
 # Weights below this part of the precision of the values are left out.
 CUT = 1 / 64
 
@@ -71,7 +69,7 @@ class Series:
 def prepare_series(operator: Operator, dt: float, *, compiled: bool = False) -> Series:
     """The series of a step of `dt` hours. compiled: whether kernels may compute gradients."""
     fastest = operator.loss.detach().flatten(1).amax(1)
-    rate = torch.where(fastest > 0, ABOVE * fastest, 1.0)
+    rate = rate_above(fastest)
     mean = (rate * dt).cpu().numpy()
     far = mean > MOST
     weights, tails = poisson(np.where(far, 0.0, mean), torch.finfo(operator.dtype).eps * CUT)

@@ -24,11 +24,11 @@ from torch import Tensor
 
 from torchfilm.signals.compiled_uptake import EVENTS, CompiledUptake, compiled_uptake
 from torchfilm.signals.grid import Shape
-from torchfilm.signals.mixing import mixing_of
+from torchfilm.signals.mixing import mixing_of, rate_above
 from torchfilm.signals.series_sums import sums
 from torchfilm.signals.transport_iterative import Unsplit, prepare_backward_euler
 from torchfilm.signals.transport_operator import Operator
-from torchfilm.signals.transport_series import ABOVE, CUT, poisson
+from torchfilm.signals.transport_series import CUT, poisson
 from torchfilm.tools.tangents import both
 
 
@@ -68,7 +68,7 @@ class UptakeTransport:
             operator = replace(operator, source=given if source is None else source + given)
         u = u.double()
         fastest = both(operator.loss.detach())[0].flatten(1).amax(1)
-        rate = torch.where(fastest > 0, ABOVE * fastest, 1.0).expand(u.shape[0])
+        rate = rate_above(fastest).expand(u.shape[0])
         over = rate * dt > EVENTS
         far = over if far is None else far | over
         if bool(far.all()):
