@@ -138,9 +138,16 @@ class Objective(metaclass=checks.KnownKeywords):
     @property
     def least_squares(self) -> bool:
         """Whether the loss is a sum of squares with exact derivatives."""
-        return (
-            self.task.target.squares and bool(self.task.space.moving) and not self.why_differences
-        )
+        return self._may_be_squares and not self.why_differences
+
+    @property
+    def why_no_squares(self) -> str:
+        """Why a sum of squares has no exact derivatives, or ""."""
+        return self.why_differences if self._may_be_squares else ""
+
+    @property
+    def _may_be_squares(self) -> bool:
+        return self.task.target.squares and bool(self.task.space.moving)
 
     def copies(self, slopes: bool) -> int:
         """Colonies that are grown for each loss."""

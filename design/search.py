@@ -331,7 +331,7 @@ class Search(TaskOptions):
             return Chosen(method_of(self.method))
         resumed = path is not None and Path(path).is_file()
         before = Study.read(path).about.get("method", "") if path is not None and resumed else ""
-        return choose(
+        chosen = choose(
             task.space.size,
             colonies / task.colonies_each,
             task.goals,
@@ -344,6 +344,8 @@ class Search(TaskOptions):
             math.inf if task.space.digest else designs_of(task.space),
             (colonies - self._reserved(colonies)) / task.colonies_each,
         )
+        why = "" if task.tried.stochastic else self.objective.why_no_squares
+        return replace(chosen, why=f"{chosen.why}; no least squares: {why}") if why else chosen
 
     def _open_study(self, path: str | Path | None, method: str) -> Study:
         task = self.objective.task

@@ -205,7 +205,7 @@ class Wiring:
         netlist, scale = self.assigner.netlist, self.assigner.reporter.scale
         sensors = self.sensors
 
-        def rates(u, s, p, cell):  # type: ignore[no-untyped-def]
+        def rates(u, s, p, cell):
             activity: dict[str, Any] = {}
             for name, sensor in sensors.items():
                 outside = sensor.reads.startswith(OUTSIDE)

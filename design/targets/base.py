@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 OUTSIDE = "out."
 # The loss of a failed colony: where losses have no upper limit, and where they end at 1.
 WORST, FAILED = 1e9, 1.5
+FAR = 100.0  # spreads, from which on losses grow linearly; those beyond MOST count as so far
+MOST = 1e6
 # A target may read these, and what serves the numerics, but they are none to offer.
 OF_DIVISION = ("division_threshold", "birth_length")
 
@@ -291,6 +293,15 @@ def species_name(name: str, given: object) -> None:
         raise checks.input_error(
             name, given, 'the name of a species, such as "yfp", or of a signal, such as "out.ahl"'
         )
+
+
+def huber(apart: Tensor) -> Tensor:
+    """Residuals of these differences in spreads: they are the same up to FAR, and beyond it their
+    squares grow linearly (Huber, Ann. Math. Stat. 35, 73, 1964), so that a search knows the way
+    back. A square is at most a fifth of a failed loss."""
+    size = apart.abs().clamp(max=MOST)
+    beyond = FAR * (2.0 * size.clamp(min=FAR) / FAR - 1.0).sqrt()
+    return torch.where(size > FAR, apart.sign() * beyond, apart)
 
 
 def requiring_gradients(state: tf.State, names: Iterable[str]) -> tf.State:

@@ -114,7 +114,7 @@ def centre_at(state: tf.State, centre: Centre, place: int) -> tuple[float, float
     if centre == "colony":
         x, y = tf.measure.colony_centre(state)[place, :2].tolist()
         return x, y
-    return centre  # type: ignore[return-value]
+    return centre
 
 
 def lines(

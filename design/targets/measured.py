@@ -11,12 +11,19 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import WORST, Target, ended_elsewhere, inner_targets, requiring_gradients
+from design.targets.base import (
+    WORST,
+    Target,
+    ended_elsewhere,
+    huber,
+    inner_targets,
+    requiring_gradients,
+)
 from torchfilm import checks
 
 Measure = Callable[[tf.State], Tensor]
+TRIED = 4  # random levels, to see whether a measure depends on them
 NO_CELLS = "no cells remain"  # why a colony without cells has failed
-FARTHEST = 100.0  # spreads: a measure that is farther off counts as so far
 
 
 @dataclass(frozen=True)
@@ -29,15 +36,16 @@ class Measured(Target):
     cells of that colony alone. wanted: of each, a number, or the range (low, high) within which any
     will do; ±inf for an open end. spread: of each, above 0, by how much off counts as 1.
 
-    Loss: the mean over the measures of ((measure − wanted)/spread)², 0 within a range. It has no
-    upper limit but 100², a measure 100 spreads off. A colony in which a measure is not a number has
-    failed, and so has one in which no cell is left; with extinct=True that one is measured, too, as
-    where a drug is to kill all; among several goals, if all of them can be so. For several
-    processes, functions stand at the top level of a file.
+    Loss: the mean over the measures of ((measure − wanted)/spread)², 0 within a range. Beyond 100
+    spreads a square grows linearly (Huber). A colony in which a measure is not a number has failed,
+    and so has one in which no cell is left; with extinct=True that one is measured, too, as where a
+    drug is to kill all; among several goals, if all of them can be so. For several processes,
+    functions stand at the top level of a file.
 
     smooth: say True where the functions have derivatives by all that the parameters change, as
     means of levels have, and counts of cells do not: then least squares search with exact
-    derivatives, where the scene has them. A measure that gives no gradient at all is found out.
+    derivatives, where the scene has them. A measure that gives no gradient at all is found out,
+    unless it does not depend on levels, as the volume of a colony does not.
 
     time: h, when the values were measured, at which colonies then end. Measures of several times
     make a course: `ObservedCourse([Measured(…, time=1.0), Measured(…, time=2.0)])`.
@@ -124,6 +132,7 @@ class Measured(Target):
         with torch.enable_grad():
             moved = requiring_gradients(state, state.fields)
             lacking = [n for n, x in self.functions.items() if not _has_gradient(x, moved)]
+        lacking = [n for n in lacking if _depends_on_levels(self.functions[n], state)]
         names = " and ".join(map(repr, lacking))
         return f"no gradient passes through {names} of Measured" if lacking else ""
 
@@ -154,7 +163,7 @@ class Measured(Target):
             low, high = self.wanted[name]  # type: ignore[misc]
             beyond = torch.where(found > high, found - high, torch.where(found.isnan(), found, 0.0))
             apart = torch.where(found < low, found - low, beyond)
-            parts.append((apart / self.spread[name]).clamp(-FARTHEST, FARTHEST))
+            parts.append(huber(apart / self.spread[name]))
         return torch.stack(parts, 1) / math.sqrt(len(parts))
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
@@ -212,6 +221,25 @@ def _has_gradient(measure: Measure, tracked: tf.State) -> bool:
             return bool(measure(tracked).requires_grad)
     except (RuntimeError, TypeError, ValueError):  # as where it asks for NumPy's numbers
         return False
+
+
+def _depends_on_levels(measure: Measure, state: tf.State) -> bool:
+    """Whether a measure changes with the numbers of the cells and the signals. One of places and
+    sizes alone, such as the volume of a colony, has a derivative of 0 by what circuits do."""
+    draws = torch.Generator().manual_seed(0)
+    fields = {n: x for n, x in state.fields.items() if x.is_floating_point()}
+    found = []
+    try:
+        with torch.no_grad(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for _ in range(TRIED):
+                drawn = {n: 10.0 ** (12.0 * torch.rand(x.shape, generator=draws) - 6.0) for n, x in
+                         fields.items()}  # fmt: skip
+                moved = state.with_fields(**{n: x.to(fields[n]) for n, x in drawn.items()})
+                found.append(measure(moved))
+            return not all(torch.equal(found[0], other) for other in found[1:])
+    except Exception:  # of a function that takes no such levels
+        return True
 
 
 def extinct_words(target: Target, reasons: Iterable[str]) -> list[str]:

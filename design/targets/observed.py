@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import Target, ended_elsewhere, require
+from design.targets.base import Target, ended_elsewhere, huber, require
 from design.targets.observed_like import counted, named, shared_plan, with_caps
 from design.targets.observed_masks import masks_table
 from design.targets.observed_table import read_table, warn_of_empty
@@ -31,7 +31,6 @@ from torchfilm import checks
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FARTHEST = 100.0  # spreads: a statistic that is farther off counts as so far
 ENOUGH = 3  # colonies from which on the spread between them is measured
 FINEST = 0.01  # the least spread, relative to the greatest statistic of its group
 COUNT = 0.02  # the least spread of the logarithm of a number of cells
@@ -54,7 +53,8 @@ class Observed(Target):
     seen from above, in the x–y plane.
 
     Loss: the mean over the statistics of ((statistic − value)/spread)². It is about 1 for a colony
-    that grew as the observed ones did. It has no upper limit but 100², a statistic 100 spreads off.
+    that grew as the observed ones did. Beyond 100 spreads a square grows linearly (Huber), so that
+    data which are far off still tell a search where to go.
 
     spread is bootstrapped: the cells of each colony are drawn 200 times with replacement; the
     number of cells has 1/√N, as if divisions were independent. This leaves out what all cells of a
@@ -63,7 +63,6 @@ class Observed(Target):
     statistic of their kind.
     """
 
-    failed = FARTHEST**2
     pattern = False
     values: tuple[float, ...]
     spread: tuple[float, ...]
@@ -300,7 +299,7 @@ class Observed(Target):
     def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         found = self.statistics(state, history)
         apart = (found - found.new_tensor(self.values)) / found.new_tensor(self.spread)
-        return apart.clamp(-FARTHEST, FARTHEST) / math.sqrt(len(self.values))
+        return huber(apart) / math.sqrt(len(self.values))
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         apart = self.residuals(state, history)

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import ended_elsewhere
+from design.targets.base import ended_elsewhere, huber
 from design.targets.measured import Measure, Measured
-from design.targets.observed import FARTHEST, Observed
+from design.targets.observed import Observed
 from design.targets.observed_measures import MeasureStatistics, ObservedMeasures, as_data
 from design.targets.statistics import LOG_CELLS, ColonyStatistics, birth_note
 from torchfilm import checks, tables
@@ -109,7 +109,7 @@ class ObservedCourse(Observed):
 
     @staticmethod
     @checks.known_keywords
-    def from_table(  # type: ignore[override]
+    def from_table(
         table: str | Path | Mapping[str, Any],
         *,
         time_unit: str | None = None,
@@ -259,7 +259,7 @@ class ObservedCourse(Observed):
         reached = self._reached(state, history)
         kept = torch.cat([torch.where(r, x, 0.0) for r, x in zip(reached, parts, strict=True)], 1)
         count = sum((r * x.shape[1] for r, x in zip(reached, parts, strict=True)), reached[0] * 0)
-        return kept.clamp(-FARTHEST, FARTHEST) / count.clamp(min=1).double().sqrt()
+        return huber(kept) / count.clamp(min=1).double().sqrt()
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:

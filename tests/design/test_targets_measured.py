@@ -12,6 +12,7 @@ import torchfilm as tf
 from design import Local, Measured, ObservedCourse, Parameter, Search, Sobol, Task, Weighted
 from design.objective import Objective
 from design.saved_design import load_design
+from design.targets.base import huber
 
 
 def longest(state: tf.State) -> torch.Tensor:
@@ -53,9 +54,27 @@ def test_open_ranges_and_the_farthest():
     state = colonies([2.0], [0])
     endless = Measured({"it": lambda s: s.counts / 0.0}, {"it": (0.0, math.inf)}, {"it": 1.0})
     assert endless.loss(state).tolist() == [0.0]
-    for wanted, loss in (((1.0, math.inf), 0.0), ((-math.inf, 1.0), 100.0), (1e9, 1e4)):
+    most = 1e4 * (2e4 - 1)  # a million spreads
+    for wanted, loss in (
+        ((1.0, math.inf), 0.0), ((-math.inf, 1.0), 100.0), (12.0, 1e4), (1e9, most), (-1e30, most),
+    ):  # fmt: skip
         target = Measured({"longest": longest}, {"longest": wanted}, {"longest": 0.1})
         assert target.loss(state).tolist() == pytest.approx([loss])
+        assert loss < target.failed / 4
+
+
+def test_far_from_the_data_residuals_are_hubers():
+    """Their value and slope are whole at 100 spreads, and beyond it the square is linear."""
+    apart = torch.tensor([-300.0, -100.0, -1.0, 0.0, 99.9, 100.0, 100.1, 5e3], dtype=torch.float64)
+    apart.requires_grad_()
+    square = huber(apart).square()
+    (slope,) = torch.autograd.grad(square.sum(), apart)
+    inside = apart.detach().abs() <= 100
+    assert torch.equal(square[inside], apart[inside] ** 2)
+    linear = 1e4 * (2 * apart.abs() / 100 - 1)
+    assert torch.allclose(square[~inside], linear[~inside], rtol=1e-14)
+    assert slope.tolist() == pytest.approx([-200.0, -200.0, -2.0, 0.0, 199.8, 200.0, 200.0, 200.0])
+    assert bool(huber(torch.tensor([math.nan])).isnan())
 
 
 def test_a_measure_that_is_no_number_fails_its_colony():
@@ -191,7 +210,11 @@ def _through_numpy(state):
 
 
 def _cells(state):
-    return state.counts.double()
+    return state.counts.double()  # which no circuit changes
+
+
+def _bright_cells(state):
+    return state.groups.sum((state.g > 0.3).double())
 
 
 @pytest.mark.parametrize("course", [False, True])
@@ -199,7 +222,7 @@ def _cells(state):
     ("measure", "lacking"),
     [
         (_averaged, False), (_brightest, False), (_through_numbers, True),
-        (_through_numpy, True), (_cells, True),
+        (_through_numpy, True), (_cells, False), (_bright_cells, True),
     ],
 )  # fmt: skip
 def test_smooth_measures_that_pass_no_gradient_are_found_out(measure, lacking, course):
@@ -221,3 +244,48 @@ def test_smooth_measures_that_pass_no_gradient_are_found_out(measure, lacking, c
     assert bool(task.why_rough) == lacking
     if lacking:
         assert "no gradient passes through 'm' of Measured" in task.why_rough
+
+
+def raw(state: tf.State) -> torch.Tensor:
+    levels = state.gain * state.gfp + state.back
+    return state.groups.sum(state.volume * levels) / state.groups.sum(state.volume)
+
+
+def od(state: tf.State) -> torch.Tensor:
+    return torch.log10(state.groups.sum(state.volume))
+
+
+def lit_cells(state: tf.State) -> torch.Tensor:
+    return state.groups.sum((state.gfp > 0.5).double())
+
+
+def reporter(gain=100.0, back=50.0) -> tf.Scene:
+    rates = lambda u, s, p, cell: {"gfp": 8.0 - 0.4 * u.gfp}
+    circuit = tf.Circuit(
+        rates, species=("gfp", "gain", "back"), initial={"gain": gain, "back": back},
+        dilution=("gfp",),
+    )  # fmt: skip
+    return tf.Scene(
+        tf.Growth(rate=0.7), tf.Division(length=4.0, conserves="volume"), circuit, dim=2, dt=0.1
+    )
+
+
+@pytest.mark.parametrize("beside, fits", [(od, True), (lit_cells, False)])
+def test_a_measure_of_sizes_alone_leaves_the_others_their_least_squares(beside, fits):
+    """With an optical density beside fluorescence, a search had no derivatives, and found a
+    background of 67 or 25 for 80."""
+    *_, truth = tf.simulate(reporter(150.0, 80.0), until=1.0, dtype=torch.float64)
+    *_, half = tf.simulate(reporter(150.0, 80.0), until=0.5, dtype=torch.float64)
+    functions = {"raw": raw, "beside": beside}
+    values = {n: [float(f(s)) for s in (half, truth)] for n, f in functions.items()}
+    course = ObservedCourse.of_measures(
+        functions, times=(0.5, 1.0), values=values, spread={"raw": 1.0, "beside": 0.01}, smooth=True
+    )
+    space = [Parameter("gain", 10.0, 1000.0, log=True), Parameter("back", 1.0, 500.0, log=True)]
+    search = Search(reporter, space, course, replicates=1, dtype=torch.float64)
+    if not fits:
+        assert "no gradient passes through 'beside'" in search.objective.why_no_squares
+        return
+    best = search.run(colonies=60, progress=False)
+    assert best.values["gain"] == pytest.approx(150.0, rel=1e-3)
+    assert best.values["back"] == pytest.approx(80.0, rel=1e-3)

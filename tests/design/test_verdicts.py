@@ -117,10 +117,10 @@ def test_luck_is_a_loss_far_below_that_of_fresh_seeds():
 def test_the_worst_of_two_is_less_than_the_worst_of_ten_without_luck():
     rng = np.random.default_rng(0)
     said = 0
-    for _ in range(300):
+    for _ in range(120):
         losses = rng.lognormal(0.0, 0.4, 12)
         said += bool(luck(losses[:2].tolist(), losses[2:].tolist(), reduce="worst"))
-    assert said < 45  # 33 % of them, before
+    assert said < 18  # 33 % of them, before
 
 
 def test_missed_constraints_are_words_in_tables_and_pictures(tmp_path):
