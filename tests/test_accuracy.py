@@ -34,6 +34,7 @@ def rooms():
         # no test reads how long a run takes: one is timed, of the cells once
         patch.setattr(study.timed, "__defaults__", (1,))
         patch.setattr(circuits, "COPIES", 1)
+        patch.setattr(splitting, "COLONIES", 1)
         yield {"circuits": circuits, "signals": signals, "splitting": splitting, "study": study}
     sys.path[:] = before
     for name in {"circuits", "signals", "splitting", "study"} - known:

@@ -93,3 +93,67 @@ def test_it_runs_in_inference_mode():
     with torch.inference_mode():
         found = run(lambda s: s.with_fields(growth_rate=s.growth_rate + 1.0))
     assert found.growth_rate.tolist() == [1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "shape"),
+    [
+        ("axis", lambda x: x[:1], r"\(1, 2\): it must be \(2, 2\), one value for each cell"),
+        ("length", lambda x: x[:, None], r"\(2, 1\): it must be \(2,\)"),
+        ("length", lambda x: x.max(), r"\(\): it must be \(2,\)"),
+    ],
+)
+@pytest.mark.parametrize("cells", [False, True])
+def test_columns_of_another_shape(name, change, shape, cells):
+    """Kernels read beyond them: the process crashed, or went on with what lay there."""
+    wrong = lambda s: s.replace(**{name: change(getattr(s, name))})
+    with pytest.raises(tf.InputError, match=rf"Mine\.step gave '{name}' of shape {shape}"):
+        run(wrong, ("cells",) if cells else (name,))
+
+
+def test_a_column_that_is_no_tensor_and_a_field_of_another_shape():
+    with pytest.raises(tf.InputError, match=r"Mine\.step gave 'length' as a ndarray, not a tensor"):
+        run(lambda s: s.replace(length=s.length.numpy()), ("length",))
+    short = lambda s: s.replace(fields={**s.fields, "growth_rate": s.growth_rate[:1]})
+    with pytest.raises(tf.InputError, match=r"shape of the field 'growth_rate' = \(1,\)"):
+        run(short)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: {"axis": s.axis[:1]}, r"state\.axis = '\(1, 2\).*of shape \(2, 2\)"),
+        (lambda s: {"length": s.length[:, None]}, r"state\.length = '\(2, 1\).*of shape \(2,\)"),
+        (lambda s: {"length": s.length.numpy()}, r"state\.length = .*must be a tensor"),
+        (lambda s: {"position": s.position.tolist()}, r"state\.position = .*must be a tensor"),
+        (lambda s: {"uid": s.uid[:1]}, r"state\.uid = '\(1,\)"),
+    ],
+)
+def test_a_step_takes_no_state_with_columns_of_another_shape(change, message):
+    model = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2)).bind(2)
+    state = model.start()
+    with pytest.raises(tf.InputError, match=message):
+        model.step(state.replace(**change(state)))
+
+
+def test_cell_types_that_founders_bring_may_be_needed():
+    @dataclass(frozen=True)
+    class Typed(tf.Effect):
+        title, stage = "typed", 15
+
+        def needs(self):
+            return ["cell_type"]
+
+        def step(self, state, dt, values):
+            return state
+
+    two = tf.Cells([[0.0, 0.0], [5.0, 0.0]], [[1.0, 0.0]] * 2, cell_type=[0, 1])
+    by_type = tf.Growth(rate={0: 1.0, 1: 2.0})
+    for scene in (
+        tf.Scene(Typed(), tf.Growth(rate=1.0), founders=two),
+        tf.Scene(Typed(), by_type, dim=2),
+    ):
+        model = scene.bind()
+        assert model.step(model.start(), 0.1).cell_type.dtype == torch.int64
+    with pytest.raises(tf.InputError, match="typed needs the field 'cell_type'"):
+        tf.Scene(Typed(), tf.Growth(rate=1.0), dim=2)

@@ -210,7 +210,7 @@ def test_a_bound_model_keeps_its_values():
 class Ageing(tf.Effect):
     """Notes the rates of the cells, looked up by rows."""
 
-    rate: tf.Value = tf.physical(1.0)  # noqa: RUF009
+    rate: tf.Value = tf.physical(1.0)
     title: str = "age"  # type: ignore[misc]
     stage = 35
 

@@ -29,6 +29,8 @@ from torchfilm.model import Model
 from torchfilm.physics.adhesion import Adhesion
 from torchfilm.physics.walls import Box, Channel, Plane, Sphere
 from torchfilm.replay import GrowthRecording, Replay
+from torchfilm.resolver import Values
+from torchfilm.rule_views import CellsView, DivisionView
 from torchfilm.scene import Scene
 from torchfilm.signals.boundary_conditions import (
     BoundaryConditions,
@@ -49,7 +51,7 @@ from torchfilm.tools.memory import keep_memory
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.timing import Timings
-from torchfilm.values import PerColony, physical
+from torchfilm.values import PerColony, Value, physical
 from torchfilm.version import __version__
 
 if TYPE_CHECKING:
@@ -85,10 +87,12 @@ __all__ = [
     "BoundaryConditions",
     "Box",
     "Cells",
+    "CellsView",
     "Channel",
     "Circuit",
     "Dirichlet",
     "Division",
+    "DivisionView",
     "Effect",
     "Erosion",
     "Field",
@@ -130,6 +134,8 @@ __all__ = [
     "Timings",
     "Tuned",
     "Uniform",
+    "Value",
+    "Values",
     "__version__",
     "advance",
     "cell_table",
@@ -160,12 +166,14 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name in _LAZY_MODULES:
-        return import_module(f"torchfilm.{name}")
-    if name in _LAZY:
-        return getattr(import_module(_LAZY[name]), name)
-    raise AttributeError(f"module 'torchfilm' has no attribute {name!r}")
+if not TYPE_CHECKING:  # type checkers know the names above, and no others
+
+    def __getattr__(name: str) -> Any:
+        if name in _LAZY_MODULES:
+            return import_module(f"torchfilm.{name}")
+        if name in _LAZY:
+            return getattr(import_module(_LAZY[name]), name)
+        raise AttributeError(f"module 'torchfilm' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -15,13 +15,16 @@ from torchfilm.parameters import parameters
 from torchfilm.resolver import FirstValue
 from torchfilm.rule_views import KNOWN_FIELDS, MEANS
 from torchfilm.state import CELL, OUTSIDE, State
-from torchfilm.tools import checks
+from torchfilm.tools import checks, row_checks
 from torchfilm.tools.hashing import trained
 from torchfilm.tools.tangents import tracked
 from torchfilm.tools.warn_once import warn
 
 if TYPE_CHECKING:
     from torchfilm.model import Model
+
+# The columns of cells, as `row_checks.is_whole` takes them.
+GEOMETRY = ("position", "axis", "length", "radius", "colony", "uid", "parent")
 
 
 def check_names(effects: Sequence[BoundEffect], declared: Iterable[str], state: State) -> None:
@@ -230,6 +233,9 @@ def check_fits(state: object, model: Model, fields: Mapping[str, object]) -> Non
     if not isinstance(state, State):
         hint = "Such as model.start(), or the last one of tf.simulate(…)."
         raise checks.input_error("step(state)", state, "a tf.State", hint)
+    if not row_checks.is_whole([getattr(state, n) for n in GEOMETRY]):
+        columns = {n: getattr(state, n) for n in GEOMETRY}
+        row_checks.check_geometry(columns, state.colonies, model.dim, model.batch.dtype)
     alike = state.dim == model.dim and state.dtype == model.batch.dtype
     if not (alike and fields.keys() <= state.fields.keys()):
         model.check(state)

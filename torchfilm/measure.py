@@ -18,7 +18,7 @@ from torchfilm.physics.surfaces import FlatSurface
 from torchfilm.physics.walls import Wall, depth_in_walls
 from torchfilm.spatial import binned_mean, checked_edges, kinds_of, pair_correlation, quantity
 from torchfilm.state import State
-from torchfilm.tools import checks
+from torchfilm.tools import checks, row_checks
 from torchfilm.tools.connected import components
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.threads import one_torch_thread
@@ -291,7 +291,7 @@ def tilt(state: State) -> Tensor:
 @of_a_state
 @torch.no_grad()
 def strains(
-    state: State, name: str = "cell_type", *, kinds: Sequence[int] | None = None
+    state: State, name: str = "cell_type", *, kinds: row_checks.Numbers | None = None
 ) -> dict[int, Tensor]:
     """How many cells of each kind a colony has: (B,) int64 by the values of a field of whole
     numbers, such as the cell type or a neutral label that daughters inherit. kinds: of which to
@@ -306,7 +306,7 @@ def strains(
 @of_a_state
 @torch.no_grad()
 def heterozygosity(
-    state: State, name: str = "cell_type", *, edges: Sequence[float] | None = None
+    state: State, name: str = "cell_type", *, edges: row_checks.Numbers | None = None
 ) -> Tensor:
     """The probability that two cells drawn at random, with replacement, are of different kinds,
     1 − Σ p², of each colony: (B,) float64. 0 where one kind is fixed; NaN without cells.
@@ -335,7 +335,7 @@ def heterozygosity(
 
 @of_a_state
 def profile(
-    state: State, name: str | Tensor, edges: Sequence[float], *, along: str | Tensor = "x"
+    state: State, name: str | Tensor, edges: row_checks.Numbers, *, along: str | Tensor = "x"
 ) -> Tensor:
     """The mean of a quantity over the cells of each colony in bins along a coordinate, (B, K)
     float64; NaN in a bin without cells.
@@ -357,7 +357,7 @@ def profile(
 
 @of_a_state
 @torch.no_grad()
-def correlation(state: State, name: str | Tensor, edges: Sequence[float]) -> Tensor:
+def correlation(state: State, name: str | Tensor, edges: row_checks.Numbers) -> Tensor:
     """How alike a quantity y is in two cells of a colony by the distance of their centres, (B, K)
     float64: the mean of (yᵢ − ȳ)(yⱼ − ȳ) over the pairs in each bin of distances, over the variance
     of y. 1 for pairs that are as alike as a cell is itself, 0 where nothing is shared; its first
@@ -422,8 +422,9 @@ def clusters(state: State, gap: float, name: str | None = None) -> Tensor:
 @torch.no_grad()
 def alike_neighbours(state: State, gap: float, name: str = "cell_type") -> Tensor:
     """The share of a colony's pairs of neighbours, less than `gap` µm apart, that are of one kind:
-    (B,) float64, NaN without pairs. Kinds that are well mixed come to 1 − `heterozygosity`, but for
-    1/N, and kinds that have sorted to nearly 1. name: a field of whole numbers, as for `strains`.
+    (B,) float64, NaN without pairs. Kinds of one size that are well mixed come to 1 −
+    `heterozygosity`, but for 1/N, and kinds that have sorted to nearly 1; large cells beside small
+    ones have more neighbours each. name: a field of whole numbers, as for `strains`.
     """
     kind = kinds_of("alike_neighbours", state, name)
     first, second, _ = neighbours(state, gap)

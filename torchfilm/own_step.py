@@ -59,6 +59,10 @@ def check_step(
         new = getattr(after, what) if what in COLUMNS else after.fields[what]
         if new is old:
             continue
+        if not isinstance(new, Tensor):
+            raise checks.InputError(f"{name}.step gave {what!r} as {_shown(new)}, not a tensor.")
+        if what in COLUMNS:
+            _check_shape(name, what, new, old, after)
         if new.dtype != old.dtype:
             raise checks.InputError(
                 f"{name}.step gave {what!r} as {_type(new)}; it is {_type(old)}: write"
@@ -71,7 +75,19 @@ def check_step(
                 f"{name}.step changed {what!r}, which its writes() does not name: a scene is"
                 " ordered, and growth recorded, by what effects say that they change."
             )
+    after.check_fields()
     return after
+
+
+def _check_shape(name: str, what: str, new: Tensor, old: Tensor, after: State) -> None:
+    """Kernels trust that columns have a row for each cell or colony."""
+    rows = after.colonies if what in PER_COLONY else after.cells
+    if new.shape != (rows, *old.shape[1:]):
+        each = "colony" if what in PER_COLONY else "cell"
+        raise checks.InputError(
+            f"{name}.step gave {what!r} of shape {tuple(new.shape)}: it must be"
+            f" {(rows, *old.shape[1:])}, one value for each {each}."
+        )
 
 
 def _shown(given: object) -> str:

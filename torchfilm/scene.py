@@ -26,6 +26,7 @@ from torchfilm.tools import checks, displays
 from torchfilm.tools.hashing import digest, digest_of_code, digest_of_weights, without_addresses
 from torchfilm.tools.listings import differences
 from torchfilm.tools.warn_once import once, warn
+from torchfilm.values import ByType
 from torchfilm.version import __version__
 
 CHANGEABLE = ("name", "dt", "founders", "recipe", "settings", "accuracy", "dim")
@@ -368,9 +369,12 @@ def _check_fields(effects: Sequence[Effect], dim: int, founders: Cells) -> dict[
                 raise checks.InputError(_kept_twice(effect, value, f.name, declared[f.name][1]))
             declared[f.name] = (f, effect.title)
     names = {name: title for name, (_, title) in declared.items()}
+    by_type = [isinstance(v, ByType) for e in effects for v, _ in e.physical_values().values()]
+    types = {"cell_type"} if founders.cell_type is not None or any(by_type) else set()
+    brought = {*founders.extra} | types
     for effect in effects:
         for name in effect.needs():
-            if name not in declared and name not in BUILT_IN and name not in founders.extra:
+            if name not in declared and name not in BUILT_IN and name not in brought:
                 raise checks.InputError(
                     f"{effect.title} needs the field {name!r}, which nothing in this scene"
                     f" provides. It has: {', '.join(declared) or 'no field'}."

@@ -341,14 +341,14 @@ class State:
         note = Ended(fate, *(x[lost] for x in (self.own_colony_id, self.uid, self.length)))
         return self.take(kept).replace(ended=(*self.ended, note))
 
-    def select(self, colonies: Tensor | list[int]) -> State:
+    def select(self, colonies: row_checks.Rows) -> State:
         """Some colonies of the batch, by their places, in the order given. Each goes on as it would
         have in the whole."""
         places = row_checks.checked_places("colonies", colonies, self.colonies, self.device)
         return state_colonies.selected(self, places)
 
     def put(
-        self, colonies: Tensor | list[int], other: State, taken: Tensor | list[int] | None = None
+        self, colonies: row_checks.Rows, other: State, taken: row_checks.Rows | None = None
     ) -> State:
         """The state with others in place of some colonies: new ones, as after an episode, or
         copies, as in a particle filter.

@@ -22,6 +22,7 @@ from functools import partial
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -279,7 +280,8 @@ class Distribution(metaclass=checks.KnownKeywords):
             object.__setattr__(self, name, made)
 
 
-Value = float | Tensor | Sequence[float] | Mapping[int, Any] | Distribution | PerColony
+Value = float | Tensor | np.ndarray | Sequence[float] | Mapping[int, Any] | Distribution | PerColony
+ScheduledValue = Value | Schedule
 
 
 def quotient(number: float, name: str, value: Any) -> Any:

@@ -306,7 +306,7 @@ def modules() -> dict[str, ModuleType]:
                 continue
             kind = _Renderers if name.endswith("Renderers") else ModuleType
             made[name] = kind(name)
-            made[name].__path__ = []  # type: ignore[attr-defined]  # a package, without files
+            made[name].__path__ = []  # a package, without files
             if k > 1:
                 setattr(made[".".join(parts[: k - 1])], parts[k - 1], made[name])
         for given in classes:

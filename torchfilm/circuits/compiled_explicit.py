@@ -28,7 +28,7 @@ class CompiledExplicit(Compiled):
     dtype: torch.dtype
 
     @cached_property
-    def text(self) -> str:  # type: ignore[override]
+    def text(self) -> str:
         size, dtype = len(self.equations.variables), str(self.dtype).removeprefix("torch.")
         made = Functions(self.equations).values(self.dtype)
         return self.head({}) + made + method(self.method, size, dtype, self.leaves())

@@ -63,7 +63,7 @@ class _Step(torch.autograd.Function):
         return end
 
     @staticmethod
-    def backward(ctx, grad: Tensor):  # type: ignore[override]
+    def backward(ctx, grad: Tensor):
         refuse_second("the stiff method of circuits")
         (slopes,) = ctx.saved_tensors
         found = torch.zeros(slopes.shape[:2], dtype=slopes.dtype)

@@ -38,7 +38,7 @@ class CompiledMolecules(Compiled):
     how = " molecule by molecule"
 
     @cached_property
-    def text(self) -> str:  # type: ignore[override]
+    def text(self) -> str:
         made = Functions(self.equations)
         steps = method(self.network, made, self.leaves())
         return self.head(CONSTANTS) + IMPORTS + made.values() + steps

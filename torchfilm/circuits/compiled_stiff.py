@@ -114,7 +114,7 @@ class CompiledTangents(Compiled):
     how = " with derivatives"
 
     @cached_property
-    def text(self) -> str:  # type: ignore[override]
+    def text(self) -> str:
         equations, (text, prepared) = self.equations, functions(self.equations)
         names = [n for n in equations.leaves if n in (*self.moving, *self.moving_numbers)]
         turns = values_text(names, self.moving, self.moving_numbers, ("turning", "turned"))

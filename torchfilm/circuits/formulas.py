@@ -119,7 +119,7 @@ class _Plain:
 
     # --- as text -------------------------------------------------------------------------------
 
-    name = staticmethod(_plain_name)  # type: ignore[assignment]
+    name = staticmethod(_plain_name)
 
     def number(self, value: float) -> tuple[str, int]:
         return f"{value:.6g}", ATOM

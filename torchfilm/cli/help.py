@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
-from types import ModuleType
+from types import ModuleType, UnionType
 from typing import Annotated, Any
 
 import tyro
@@ -50,7 +50,7 @@ def describe(name: str) -> str:
         lines = [f"{title}: property"]
     else:
         lines = [_signature(title, thing)]
-    lines += [inspect.getdoc(thing) or ""]
+    lines += [_about(thing)]
     public = _public_bases(thing)
     known = {n for base in public.values() for n, _ in _members(base)}
     members = [_line(f"{title}.{n}", m) for n, m in _members(thing) if n not in known]
@@ -181,8 +181,8 @@ class _Plain(str):
 
 def _first(thing: Any) -> str:
     """The first sentence of a docstring, on one line; of a number or a table, nothing."""
-    documented = callable(thing) or isinstance(thing, (ModuleType, property))
-    doc = (inspect.getdoc(thing) or "") if documented else ""
+    documented = callable(thing) or isinstance(thing, (ModuleType, property, UnionType))
+    doc = _about(thing) if documented else ""
     paragraph = " ".join(doc.split("\n\n")[0].split())
     open_brackets = 0
     for k, letter in enumerate(paragraph):
@@ -190,6 +190,13 @@ def _first(thing: Any) -> str:
         if not open_brackets and paragraph[k : k + 2] == ". ":  # not that of (Fig. 5)
             return paragraph[:k]
     return paragraph.removesuffix(".")
+
+
+def _about(thing: Any) -> str:
+    """A docstring; of a type for annotations, what it may be."""
+    if isinstance(thing, UnionType):
+        return f"A type, for annotations of your own.\n\n{thing}"
+    return inspect.getdoc(thing) or ""
 
 
 def _line(title: str, thing: Any) -> str:

@@ -43,7 +43,7 @@ from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.backends import check_backend
 from torchfilm.tools.parts import keywords
-from torchfilm.values import COLONY, CONCENTRATION, CONSTANT, Rule, Value, checked
+from torchfilm.values import COLONY, CONCENTRATION, CONSTANT, Rule, ScheduledValue, Value, checked
 
 Part = run.RateFunction | Sequence[Reaction | Sequence[Reaction]]
 
@@ -116,7 +116,7 @@ class Circuit(Effect):
         shared: Sequence[str] | Mapping[str, str] = (),
         backend: str | None = None,
         dilution: bool | Sequence[str] = True,
-        **parameters: Value,
+        **parameters: ScheduledValue,
     ):
         by_type: dict[int | str, Part] = (
             dict(rates.items()) if isinstance(rates, Mapping) else {EVERY: rates}

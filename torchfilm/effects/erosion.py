@@ -18,7 +18,7 @@ from torchfilm.tools import checks
 from torchfilm.tools.deterministic_math import power
 from torchfilm.tools.random import fine_uniform
 from torchfilm.tools.read_only import read_only
-from torchfilm.values import COLONY, Value, physical
+from torchfilm.values import COLONY, ScheduledValue, physical
 
 MOST = 1e200  # chance of a cell to leave, per h
 
@@ -45,7 +45,9 @@ class Erosion(Effect):
     their number and volume.
     """
 
-    rate: Value = physical(unit="µm^(1 − order)/h", least=0.0, scope=COLONY, scheduled=True)
+    rate: ScheduledValue = physical(
+        unit="µm^(1 − order)/h", least=0.0, scope=COLONY, scheduled=True
+    )
     order: float = 2.0
     spacing: float = 0.5
     floor: float = 0.0

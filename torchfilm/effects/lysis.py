@@ -19,7 +19,7 @@ from torchfilm.tools import checks
 from torchfilm.tools.random import fine_uniform
 from torchfilm.tools.read_only import read_only
 from torchfilm.tools.row_checks import check_names, check_variable, is_name
-from torchfilm.values import CONCENTRATION, Rule, Value, checked, physical
+from torchfilm.values import CONCENTRATION, Rule, ScheduledValue, checked, physical
 
 AMOUNT = Rule("conc·µm³", least=0.0, scheduled=True)
 SHARE = Rule("", least=0.0, scheduled=True)
@@ -89,8 +89,8 @@ class Lysis(Effect):
     """
 
     when: str | None = None
-    above: Value | None = physical(None, scheduled=True)
-    rate: Value | None = physical(None, unit="1/h", least=0.0, scheduled=True)
+    above: ScheduledValue | None = physical(None, scheduled=True)
+    rate: ScheduledValue | None = physical(None, unit="1/h", least=0.0, scheduled=True)
     releases: Mapping[str, Any] | None = None
     factor: str | None = None
     hazard: str | None = None

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -63,10 +64,9 @@ class Medium(Effect):
     outside: the meaning of cells outside the box. "error": the colony fails. "grow": the box grows
     with its colony, along the axes in `grows`; with "xy+z" the lower face of z stays, such as at a
     wall on which cells grow. "reservoir": around the box each signal has its `reservoir`
-    concentration; the fields NAME_reservoir sum what cells give to it, less what they
-    take. margin: how far beyond the centres of its cells a box that grows reaches, µm; it then
-    grows voxel by voxel, so that its face follows a film. Default: two voxels or more, and it grows
-    by eight.
+    concentration; the fields NAME_reservoir sum what cells give to it, less what they take. margin:
+    how far beyond the centres of its cells a box that grows reaches, µm; it then grows voxel by
+    voxel, so that its face follows a film. Default: two voxels or more, and it grows by eight.
 
     exchange: how circuits and the medium exchange signals. "together": circuits and transport of
     these signals are one equation over the step, of second order, whatever crosses a membrane or a
@@ -111,7 +111,7 @@ class Medium(Effect):
     def __init__(
         self,
         *,
-        box: tuple[Sequence[float], Sequence[float]],
+        box: Sequence[Sequence[float]] | np.ndarray,
         spacing: float | Sequence[float],
         depth: float | None = None,
         height: float = 0.0,
@@ -311,8 +311,8 @@ class Medium(Effect):
             whole = not self.halves or (name in exchanged and self.steps > 1)
             part = dt / self.steps / (1 if whole else 2)
             method, why = self.method_of(name)
-            order = f"order {2 if method == 'crank_nicolson' else 1} in steps of {part:g} h"
-            order = "exact over a step" if method in EXACT else order
+            by = 2 if method == "crank_nicolson" else 1
+            order = "exact over a step" if method in EXACT else f"order {by} in steps of {part:g} h"
             if method == "series":
                 order += (
                     f" (but where voxels exchange over {MOST:g} times in it, backward Euler, all"

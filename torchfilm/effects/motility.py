@@ -19,7 +19,7 @@ from torchfilm.tools.random import fine_uniform
 from torchfilm.tools.row_checks import check_names, check_variables
 from torchfilm.tools.vectors import safe_sqrt
 from torchfilm.tools.warn_once import warn
-from torchfilm.values import Value, numbers, physical
+from torchfilm.values import ScheduledValue, numbers, physical
 
 # How far, in radii, a cell beside others may move in a step, and its ends by a usual turn, of one
 # standard deviation. Two that meet then lie no deeper in each other than contacts can part; to pass
@@ -78,9 +78,9 @@ class Motility(Effect):
     later fails.
     """
 
-    speed: Value = physical(unit="µm/h", least=0.0, scheduled=True)
-    reversals: Value | None = physical(None, unit="1/h", least=0.0, scheduled=True)
-    turning: Value | None = physical(None, unit="rad²/h", least=0.0, scheduled=True)
+    speed: ScheduledValue = physical(unit="µm/h", least=0.0, scheduled=True)
+    reversals: ScheduledValue | None = physical(None, unit="1/h", least=0.0, scheduled=True)
+    turning: ScheduledValue | None = physical(None, unit="rad²/h", least=0.0, scheduled=True)
     factor: str | None = None
     reversal_factor: str | None = None
 

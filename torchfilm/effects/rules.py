@@ -23,11 +23,11 @@ from torchfilm.effects.bound_division_rule import DivisionRule
 from torchfilm.effects.bound_rules import MEANING, BoundRules
 from torchfilm.resolver import Values
 from torchfilm.rule_views import OF_EFFECTS, CellsView, DivisionView
-from torchfilm.signals.schedule import Schedule, warn_of_steps
+from torchfilm.signals.schedule import warn_of_steps
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import HotReload, edited, load_functions
-from torchfilm.values import CONSTANT, Rule, Value, checked_constants
+from torchfilm.values import CONSTANT, Rule, ScheduledValue, checked_constants
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Rules(Effect):
     update: Callable[[CellsView], None] | str | Path | None = None
     divide: Callable[[DivisionView, DivisionView, DivisionView], None] | None = None
     variables: Mapping[str, float] = field(default_factory=dict)
-    parameters: Mapping[str, Value | Schedule] = field(default_factory=dict)
+    parameters: Mapping[str, ScheduledValue] = field(default_factory=dict)
     path: Path | None = field(init=False, repr=False)
     functions: dict[str, Any] = field(init=False, repr=False)
     stamp: tuple[int, int] = field(init=False, repr=False)  # of the file as it was loaded

@@ -33,7 +33,7 @@ FAR = 1e6  # µm: the end of a wall that has none
 OUTSIDE_BOX = "#efe4d2"
 OBSTACLE = "#d2b48c"
 SMALL, TINY = 7.0, 6.0  # points
-ROUND = 0.1  # inches per µm above which an outline of few points has visible corners
+ROUND = 0.05  # inches of a radius above which an outline of few points has visible corners
 
 
 def draw_cells(
@@ -215,7 +215,8 @@ def add_cells(
         cells = {name: value[order] for name, value in cells.items()}
     left, right = ax.get_xlim()
     inch = ax.get_window_extent().width / ax.figure.dpi / abs(right - left)  # inches per µm
-    points = CAP_POINTS if inch < ROUND else 4 * CAP_POINTS
+    largest = inch * float(cells["radius"].max(initial=0.0))
+    points = CAP_POINTS if largest < ROUND else 4 * CAP_POINTS
     shapes = outlines(
         cells["position"][:, [u, v]],
         cells["axis"][:, [u, v]],
@@ -355,7 +356,7 @@ def colour_bar(ax: Axes, scale: Scale) -> None:
     )
     bar.set_ticks(list(ticks), labels=words)
     bar.minorticks_off()
-    bar.outline.set_linewidth(0.4)  # type: ignore[operator]
+    bar.outline.set_linewidth(0.4)
     ax.tick_params(labelsize=TINY, length=2, width=0.4, pad=1.5)
     ax.set_title(scale.title, fontsize=SMALL, pad=3, parse_math=False)
 

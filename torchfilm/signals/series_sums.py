@@ -84,7 +84,7 @@ class _Sums(torch.autograd.Function):
         return (compiled_sums.add_up if compiled else _by_terms)(mixing, gain, rows, u)
 
     @staticmethod
-    def backward(ctx, *of_sums: Tensor):  # type: ignore[override]
+    def backward(ctx, *of_sums: Tensor):
         rows, u, gain, stay, *sides = ctx.saved_tensors
         mixing, wanted = _mixing(ctx.dims, stay, sides), ctx.needs_input_grad[4:]
         if ctx.compiled and not torch.is_grad_enabled():

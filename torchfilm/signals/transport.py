@@ -142,7 +142,7 @@ class _Carried(torch.autograd.Function):
         return _run(grid, kernels, values)
 
     @staticmethod
-    def backward(ctx, back: Tensor):  # type: ignore[override]
+    def backward(ctx, back: Tensor):
         grid, kernels, adjoints = ctx.given
         if not torch.is_grad_enabled():
             return _run(grid, adjoints, back), None, None, None

@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -176,20 +176,20 @@ def default_device() -> None:
 
 class KnownKeywords(abc.ABCMeta):
     """The metaclass of classes that raise InputError, with the nearest name, for a keyword that
-    they do not take, and for an argument that is missing. (One of abstract classes, so that a
-    user's subclass may be one.)
-
-    instead, unnamed: of such a class, what to write in place of certain keywords, such as those of
-    earlier versions, and of too many arguments without a name.
-    """
+    they do not take, and for an argument that is missing. (One of abstract classes: a user's
+    subclass may be one.)
+    instead, unnamed: of such a class, what to write in place of certain keywords, as of earlier
+    versions, and of too many arguments without a name."""
 
     instead: Mapping[str, str] = {}
     unnamed: str = ""
 
-    def __call__(cls, *args: Any, **given: Any) -> Any:
-        check_call(cls.__name__, cls._known(), args, given, cls.instead, cls.unnamed)
-        default_device()
-        return super().__call__(*args, **given)
+    if not TYPE_CHECKING:  # type checkers see what each class takes, and makes
+
+        def __call__(cls, *args: Any, **given: Any) -> Any:
+            check_call(cls.__name__, cls._known(), args, given, cls.instead, cls.unnamed)
+            default_device()
+            return super().__call__(*args, **given)
 
     def _known(cls) -> inspect.Signature:
         """Of this class, worked out once."""

@@ -13,6 +13,9 @@ from torch import Tensor
 from torchfilm.tools import checks
 from torchfilm.tools.warn_once import warn
 
+# What a user may give where whole numbers, or numbers, are wanted in a row.
+Rows = Tensor | np.ndarray | Sequence[int]
+Numbers = Tensor | np.ndarray | Sequence[float]
 WHOLE = (torch.int64, torch.int32)  # of which torch takes rows
 
 
@@ -94,9 +97,21 @@ def check_declared(fields: Collection[str], declared: Collection[str]) -> None:
             raise checks.input_error("field", name, "declared", hint)
 
 
-def check_geometry(columns: Mapping[str, Tensor], colonies: int, dim: int, dtype: Any) -> None:
-    """Raises InputError where columns of cells, by name, have not a row for each cell or another
-    dtype, colonies do not stand side by side, or a cell has an impossible size."""
+def is_whole(columns: Sequence[Any]) -> bool:
+    """Whether the columns of cells, "position" and "axis" first, are tensors of one number of
+    rows."""
+    if not all(isinstance(x, Tensor) for x in columns):
+        return False
+    position, axis, *others = (x.shape for x in columns)
+    return len(position) == 2 and position == axis and all(x == position[:1] for x in others)
+
+
+def check_geometry(columns: Mapping[str, Any], colonies: int, dim: int, dtype: Any) -> None:
+    """Raises InputError where columns of cells, by name, are no tensors, have not a row for each
+    cell or another dtype, colonies do not stand side by side, or a cell has an impossible size."""
+    for name, value in columns.items():
+        if not isinstance(value, Tensor):
+            raise checks.input_error(f"state.{name}", value, "a tensor with a row for each cell")
     count = columns["colony"].numel()
     shapes = {"position": (count, dim), "axis": (count, dim)}
     dtypes = dict.fromkeys(("axis", "length", "radius"), dtype) | {"position": torch.float64}

@@ -59,7 +59,7 @@ class _Product(torch.autograd.Function):
         return out.reshape(*x.shape[:-1], len(weight))
 
     @staticmethod
-    def backward(ctx, grad: Tensor):  # type: ignore[override]
+    def backward(ctx, grad: Tensor):
         x, weight = ctx.saved_tensors
         by_x = linear(grad, weight.t()) if ctx.needs_input_grad[0] else None
         by_weight = None
