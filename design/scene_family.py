@@ -129,7 +129,8 @@ def scene_function(scene: Callable[..., tf.Scene] | str) -> Callable[..., tf.Sce
 class TriedScenes:
     """What the trial of a family's scenes found.
 
-    founders: cells at the start of a colony. dt (h): of the scene. recipe: name and arguments of a
+    founders: cells at the start of a colony. dt (h): of the scene. growth (1/h): of the slowest of
+    the designs, 0 where something may hold a colony down. recipe: name and arguments of a
     ready scene, or None. listing: its effects as text. digest: of what a listing does not show, the
     founders and the code of functions. why_regrown: the reason why colonies cannot follow recorded
     growth, or "". why_rough: the reason why losses have no exact derivatives, with one option of a
@@ -139,6 +140,7 @@ class TriedScenes:
 
     founders: int
     dt: float
+    growth: float
     recipe: tuple[str, Any] | None
     listing: list[str]
     digest: str
@@ -166,7 +168,7 @@ def try_scenes(
     """
     trials = _trial_values(family.space)
     made_of: dict[int, Any] = {}  # by the number of the trial
-    endless, unfit, rough = [], [], []
+    endless, unfit, rough, growth = [], [], [], []
     example: tf.Scene | None = None
     stochastic = False
     run: dict[str, Any] = {"seed": seed, "dtype": dtype, "replay": replay}
@@ -192,6 +194,7 @@ def try_scenes(
         made_of[k] = scene.effects, scene.drawn_from
         stochastic |= _is_stochastic(scene)
         endless.append(tried.why_endless)
+        growth.append(_free_growth(scene, tried.first))
         rough.append(why_rough(scene, tried.why_regrown) or target.why_rough(tried.first))
     # one design that does not grow is scored as such; a search in which none grows is a mistake
     if example is None or all(endless):
@@ -203,6 +206,7 @@ def try_scenes(
     return TriedScenes(
         founders=int(scene.founders.count),
         dt=scene.dt,
+        growth=min(growth),
         recipe=scene.recipe if ready else None,
         listing=scene.listing(),
         digest=tf.digest(list(made_of.values())),
@@ -256,6 +260,19 @@ def why_rough(scene: tf.Scene, why_regrown: str) -> str:
     if why_regrown:
         return f"growth depends on the design ({why_regrown})"
     return "molecules are counted one by one" if _is_stochastic(scene) else ""
+
+
+def _free_growth(scene: tf.Scene, first: tf.State) -> float:
+    """At which rate, 1/h, a colony grows on and on; 0 where something may hold it down."""
+    holding = tf.Removal, tf.Lysis, tf.Erosion, tf.Sloughing, tf.Rules, tf.Monod
+    for effect in scene.effects:
+        own = tf.effect.is_own(effect) or isinstance(effect, holding)
+        slowed = isinstance(effect, tf.Growth) and (effect.factor or effect.law == "linear")
+        walled = isinstance(effect, tf.Mechanics) and effect.walls
+        if own or slowed or walled:
+            return 0.0
+    divides = any(isinstance(e, tf.Division) for e in scene.effects)
+    return float(first.growth_rate.max()) if divides and "growth_rate" in first.fields else 0.0
 
 
 def _is_stochastic(scene: tf.Scene) -> bool:

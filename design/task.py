@@ -7,6 +7,7 @@ import dataclasses
 import math
 import operator
 import re
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
@@ -32,6 +33,8 @@ from torchfilm import checks
 
 NONE = cast(Target, None)  # the target where `targets` are given
 REDUCE = ("mean", "worst")
+TOO_MANY = 1e8  # cells of a colony
+SHORTEST = 1000  # parts of the first time among which a step is looked for
 # what studies say of the course of a step: losses of another one do not compare
 ORDER = "division at the end"
 
@@ -118,7 +121,9 @@ class Task(TaskOptions):
             )
         dt = tried.dt if self.dt is None else checks.number("dt", self.dt, above=0.0)
         if until is not None and not _is_step(until, dt):
-            raise checks.input_error("until", until, f"a whole number of steps of dt = {dt:g} h")
+            hint = "" if own is None else _fitting_words((*self.target.times, until), dt)
+            rule = f"a whole number of steps of dt = {dt:g} h"
+            raise checks.input_error("until", until, rule, hint)
         seen = max(self.target.times, default=None) if own is None else own
         if seen is not None and until is not None and until < seen * (1 - 1e-9):
             raise checks.input_error(
@@ -129,10 +134,17 @@ class Task(TaskOptions):
             raise checks.input_error("until", until, rule)
         for time in self.target.times:
             if not _is_step(time, dt):
-                raise checks.input_error(
-                    "dt", dt, f"such that {time:g} h, when the target was observed, is a step"
-                )
+                rule = f"such that {time:g} h, when the target was observed, is a step"
+                hint = _fitting_words(self.target.times, dt)
+                raise checks.input_error("dt", dt, rule, hint)
         self._set(fixed=fixed, until=until, dt=dt, family=family, tried=tried)
+        if until is not None and self.cells is None and tried.growth * until > math.log(TOO_MANY):
+            power = tried.growth * until / math.log(10.0)
+            warnings.warn(
+                f"until = {until:g} h: at {tried.growth:.3g}/h, a cell becomes 10^{power:.0f} cells"
+                " by then. Are times in hours, and rates in 1/h?",
+                stacklevel=3,
+            )
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():
@@ -325,3 +337,12 @@ def _is_step(time: float, dt: float) -> bool:
     """Whether a time, h, is one step of dt hours or a whole number of them."""
     steps = time / dt
     return round(steps) >= 1 and abs(steps - round(steps)) <= 1e-6 * steps
+
+
+def _fitting_words(times: Sequence[float], dt: float) -> str:
+    """The longest step below `dt` of which all times, h, are multiples."""
+    for k in range(1, SHORTEST + 1):
+        step = min(times) / (math.ceil(min(times) / dt) + k - 1)
+        if all(_is_step(time, step) for time in times):
+            return f"dt = {step:.9g} would do."
+    return "No step does that all these times are multiples of: round them, such as to 0.05 h."

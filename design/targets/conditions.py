@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,7 +14,10 @@ from torch import Tensor
 import torchfilm as tf
 from design.targets.base import Target
 from design.targets.goals import of_colonies
-from design.targets.several import SumOfTargets
+from design.targets.observed import Observed
+from design.targets.observed_course import ending_at
+from design.targets.observed_measures import as_data
+from design.targets.several import SumOfTargets, observed_at
 from torchfilm import checks
 
 if TYPE_CHECKING:
@@ -27,9 +32,11 @@ class Conditions(SumOfTargets):
 
     terms: pairs of arguments of the scene function, numbers by name, and the target under these.
     Each replicate of a design is one colony under each condition, all with the same random numbers.
-    Its loss is the mean of theirs. A replicate fails where one of its colonies does. Measures bear
-    the name of their condition. It has residuals and exact derivatives where its targets have. It
-    stands outermost: other targets may be in it, and it in none.
+    All go on until the last time of any data; each is compared at the times of its own. Its loss is
+    the mean of theirs; of data, that over all readings: the data of a condition weigh as much as
+    they are many. A replicate fails where one of its colonies does. Measures bear the name of their
+    condition. It has residuals and exact derivatives where its targets have. It stands outermost:
+    other targets may be in it, and it in none.
     """
 
     terms: Sequence[tuple[Mapping[str, float], Target]]
@@ -64,7 +71,7 @@ class Conditions(SumOfTargets):
         if len({self.label(k) for k in range(len(terms))}) < len(terms):
             rule = "conditions that differ in six digits, since measures bear their names"
             raise checks.input_error("Conditions.terms", [g for g, _ in terms], rule)
-        object.__setattr__(self, "parts", tuple(part for _, part in terms))
+        object.__setattr__(self, "parts", _of_one_end([part for _, part in terms]))
 
     @property
     def arguments(self) -> tuple[Mapping[str, float], ...]:
@@ -86,9 +93,20 @@ class Conditions(SumOfTargets):
         each = [part.unfit(state) for part in self.parts]
         return [each[own][k] for k, own in enumerate(self.condition_of(state).tolist())]
 
+    @cached_property
+    def _weights(self) -> tuple[float, ...]:
+        """Of the losses of all conditions: 1 on average, and by how many readings there are."""
+        data = [part for part in map(as_data, self.parts) if isinstance(part, Observed)]
+        if len(data) < len(self.parts):
+            return (1.0,) * len(self.parts)
+        counts = [len(part.values) for part in data]
+        return tuple(n * len(counts) / sum(counts) for n in counts)
+
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
-        return (
-            self.losses(state, history).gather(1, self.condition_of(state).unsqueeze(1)).squeeze(1)
+        mine = self.condition_of(state)
+        found = self.losses(state, history).gather(1, mine.unsqueeze(1)).squeeze(1)
+        return torch.where(
+            found < self.failed, found * found.new_tensor(self._weights)[mine], found
         )
 
     def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor | None:
@@ -96,7 +114,8 @@ class Conditions(SumOfTargets):
         if each is None:
             return None
         mine = self.condition_of(state).unsqueeze(1)
-        return torch.cat([x.where(mine == k, 0.0) for k, x in enumerate(each)], 1)
+        roots = [math.sqrt(weight) for weight in self._weights]
+        return torch.cat([roots[k] * x.where(mine == k, 0.0) for k, x in enumerate(each)], 1)
 
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         each = self.of_parts(lambda part, own: part.measures(state, own), state, history)
@@ -150,3 +169,18 @@ class Conditions(SumOfTargets):
     def describe(self) -> str:
         each = enumerate(self.parts)
         return "; ".join(f"{part.describe()} where {self.label(k)}" for k, part in each)
+
+
+def _of_one_end(parts: Sequence[Target]) -> tuple[Target, ...]:
+    """The targets, with data that are compared at their times in colonies that all go on until the
+    last of these."""
+    times = [t for t in map(observed_at, parts) if t is not None]
+    if len(set(times)) < 2:
+        return tuple(parts)
+    made = []
+    for part in map(as_data, parts):
+        if not isinstance(part, Observed) and observed_at(part) not in (None, max(times)):
+            rule = f"of data alone, or of one time: others are observed until {max(times):g} h"
+            raise checks.input_error("Conditions.terms", part, rule)
+        made.append(ending_at(part, max(times)) if isinstance(part, Observed) else part)
+    return tuple(made)

@@ -183,7 +183,7 @@ class Measured(Target):
 
     @property
     def bounds(self) -> dict[str, str]:
-        return {name: _words(low, high) for name, (low, high) in self.wanted.items()}  # type: ignore[misc]
+        return {name: in_words(low, high) for name, (low, high) in self.wanted.items()}  # type: ignore[misc]
 
     def misses(self, found: Mapping[str, float]) -> dict[str, float]:
         ranges = ((n, *self.wanted[n]) for n in self.functions if n in found)  # type: ignore[misc]
@@ -205,7 +205,8 @@ def _range(name: str, given: object) -> tuple[float, float]:
     return ends[0], ends[1]
 
 
-def _words(low: float, high: float) -> str:
+def in_words(low: float, high: float) -> str:
+    """A range, or a number."""
     if low == high:
         return f"= {low:g}"
     if math.isinf(low) or math.isinf(high):

@@ -14,6 +14,7 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import Target, ended_elsewhere, huber, require
+from design.targets.measured import in_words
 from design.targets.observed_like import counted, named, shared_plan, with_caps
 from design.targets.observed_masks import masks_table
 from design.targets.observed_table import read_table, warn_of_empty
@@ -296,9 +297,32 @@ class Observed(Target):
         """The statistics of each colony, (B, K) float64, with gradients by the levels."""
         return self.plan.of(seen_cells(state, self.plan, history))
 
+    @property
+    def wanted(self) -> tuple[tuple[float, float], ...]:
+        """From where to where each statistic is as observed, (K,): of data one number."""
+        return tuple((v, v) for v in self.values)
+
+    @property
+    def bounds(self) -> dict[str, str]:
+        each = zip(self.plan.names, self.wanted, strict=True)
+        return {n: in_words(low, high) for n, (low, high) in each if low != high}
+
+    def misses(self, found: Mapping[str, float]) -> dict[str, float]:
+        ranges = zip(self.plan.names, self.wanted, self.spread, strict=True)
+        return super().misses(found) | {
+            n: max(found[n] - high, low - found[n], 0.0) / spread
+            for n, (low, high), spread in ranges
+            if low != high and n in found
+        }
+
+    def apart(self, found: Tensor) -> Tensor:
+        """By how many spreads statistics (B, K) are off."""
+        low, high = (found.new_tensor(x) for x in zip(*self.wanted, strict=True))
+        near = torch.minimum(torch.maximum(found.detach(), low), high)
+        return (found - near) / found.new_tensor(self.spread)
+
     def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor:
-        found = self.statistics(state, history)
-        apart = (found - found.new_tensor(self.values)) / found.new_tensor(self.spread)
+        apart = self.apart(self.statistics(state, history))
         return huber(apart) / math.sqrt(len(self.values))
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
@@ -330,6 +354,7 @@ class Observed(Target):
     @property
     def evidence(self) -> dict[str, tuple[float, float]]:
         found = dict(zip(self.plan.names, zip(self.values, self.spread, strict=True), strict=True))
+        found = {n: seen for n, seen in found.items() if n not in self.bounds}
         if LOG_CELLS not in found:
             return found
         log, spread = found.pop(LOG_CELLS)

@@ -35,8 +35,7 @@ class ObservedConditions(Observed):
     """The data of `conditions` as one: the statistics of all, each with its condition in its name,
     such as "gfp_mean (iptg = 10)".
 
-    Raises InputError for conditions that are not all data, or where colonies would not end at one
-    time.
+    Raises InputError for conditions that are not all data, or where only some have a time.
     """
 
     plan: ConditionStatistics  # type: ignore[assignment]
@@ -57,6 +56,10 @@ class ObservedConditions(Observed):
         }
         for name, value in found.items():
             object.__setattr__(self, name, value)
+
+    @property
+    def wanted(self) -> tuple[tuple[float, float], ...]:
+        return tuple(pair for part in self.conditions.parts for pair in cast(Observed, part).wanted)
 
     def without(self, *groups: str) -> Observed:
         raise tf.InputError("leave statistics out of the data of each condition.")
@@ -95,6 +98,10 @@ def checked_data(observed: Any) -> Observed:
     if not isinstance(data, Observed):
         rule = "an Observed, such as Observed.from_table(…), a Measured, or Conditions of these"
         raise checks.input_error("observed", observed, rule)
+    for name, (low, high) in zip(data.plan.names, data.wanted, strict=True):
+        if low != high:
+            rule = "one number, as data have one"
+            raise checks.input_error(f"Measured.wanted[{name!r}]", (low, high), rule)
     return data
 
 
@@ -153,6 +160,6 @@ def _checked(conditions: Conditions) -> tuple[Observed, ...]:
         raise checks.input_error("Conditions.terms", other, rule)
     times = [part.time for part in parts]
     if len(set(times)) > 1:
-        rule = "the same under every condition, since they are simulated together"
+        rule = "given under every condition, or under none"
         raise checks.input_error("time of Conditions", times, rule)
     return parts

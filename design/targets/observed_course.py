@@ -77,11 +77,11 @@ class ObservedCourse(Observed):
     of `Observed` with a `time` each, for a search or `infer`. Numbers that a plate reader or a
     count gives at each time are a course by `of_measures`.
 
-    frames: in the order of their times, each an `Observed` or a `Measured`; whether each frame
-    shows the same colonies, or as many, does not matter. A simulated colony is compared at each of
-    these times, which must be whole numbers of steps, and ends at the last one. Ages are compared
-    in the last frame only. The statistics of frame k have its time in their names: "gfp_mean at
-    2 h".
+    frames: in the order of their times, each an `Observed` or a `Measured`, in a search also one
+    with ranges; whether each frame shows the same colonies, or as many, does not matter. A
+    simulated colony is compared at each of these times, which must be whole numbers of steps, and
+    ends at the last one. Ages are compared as a colony ends only. The statistics of frame k have
+    its time in their names: "gfp_mean at 2 h".
 
     The loss is that of `Observed` with the statistics of all frames, each weighted alike. They are
     not independent: one colony is seen several times. Raises InputError for frames without a time
@@ -92,9 +92,16 @@ class ObservedCourse(Observed):
     frames: tuple[Observed, ...] = field(repr=False)
 
     def __init__(self, frames: Sequence[Observed | Measured]):
-        given = _checked(frames)
-        kept = tuple(f.without("age") if f.plan.ages else f for f in given[:-1]) + given[-1:]
-        times = tuple(float(f.time or 0.0) for f in kept)
+        self._set(_checked(frames), None)
+
+    def _set(self, given: tuple[Observed, ...], end: float | None) -> None:
+        """Frames of colonies that end at the last one, or later, at `end` h."""
+        times = tuple(float(f.time or 0.0) for f in given)
+        end = times[-1] if end is None else end
+        kept = tuple(
+            f.without("age") if f.plan.ages and time < end else f
+            for f, time in zip(given, times, strict=True)
+        )
         found = {
             "frames": kept,
             "values": tuple(v for f in kept for v in f.values),
@@ -102,7 +109,7 @@ class ObservedCourse(Observed):
             "plan": CourseStatistics(tuple(f.plan for f in kept), times),
             "colonies": max(f.colonies for f in kept),
             "cells": sum(f.cells for f in kept),
-            "time": times[-1],
+            "time": end,
         }
         for name, value in found.items():
             object.__setattr__(self, name, value)
@@ -192,6 +199,20 @@ class ObservedCourse(Observed):
         """Of the frames, h."""
         return self.plan.times
 
+    @property
+    def wanted(self) -> tuple[tuple[float, float], ...]:
+        return tuple(pair for frame in self.frames for pair in frame.wanted)
+
+    @property
+    def _noted(self) -> tuple[Observed, ...]:
+        """The frames before the end."""
+        return tuple(f for f in self.frames if f.time != self.time)
+
+    @property
+    def _last(self) -> tuple[Observed, ...]:
+        """The frame as a colony ends, if there is one."""
+        return self.frames[len(self._noted) :]
+
     def without(self, *groups: str) -> ObservedCourse:
         """The same data without the statistics of some groups, in all frames."""
         known = {g for f in self.frames for g in f.plan.groups}
@@ -209,16 +230,17 @@ class ObservedCourse(Observed):
         return max(frame.fewest for frame in self.frames)
 
     def unfit(self, state: tf.State) -> list[str]:
-        return self.frames[-1].unfit(state)
+        each = (frame.unfit(state) for frame in self._last)
+        return next(each, [ended_elsewhere(state, self.time)] * state.colonies)
 
     def why_rough(self, state: tf.State) -> str:
         return next(filter(None, (frame.why_rough(state) for frame in self.frames)), "")
 
     def note(self, state: tf.State) -> Tensor:
-        """What tells the ages of the last frame, and the statistics of each frame but the last
+        """What tells the ages of the last frame, and the statistics of each frame before the end
         where its time has come, else NaN: (B, 2 + K')."""
         columns = [birth_note(state)]
-        for frame, time in zip(self.frames[:-1], self.times[:-1], strict=True):
+        for frame, time in zip(self._noted, self.times, strict=False):
             if abs(state.time - time) <= 1e-6 * time:
                 columns.append(frame.statistics(state))
             else:
@@ -238,23 +260,23 @@ class ObservedCourse(Observed):
         # each was noted at one step
         earlier = torch.where(seen, noted, 0.0).sum(0)
         earlier = torch.where(seen.any(0), earlier, math.nan)
-        return torch.cat([earlier, self.frames[-1].statistics(state, history)], 1)
+        return torch.cat([earlier, *(f.statistics(state, history) for f in self._last)], 1)
 
     def _reached(self, state: tf.State, history: Tensor) -> list[Tensor]:
         """Whether each colony was seen at the time of each frame, (B, 1) bool each; of one that
         reached none, the last frame tells most."""
         noted = history[:, :, 0]  # the time of each step
-        earlier = [((noted - t).abs() <= 1e-6 * t).any(0) for t in self.times[:-1]]
-        ended = not ended_elsewhere(state, self.times[-1])
-        last = ~torch.stack(earlier).any(0) | ended
-        return [reached.unsqueeze(1) for reached in (*earlier, last)]
+        earlier = [((noted - t).abs() <= 1e-6 * t).any(0) for t in self.times[: len(self._noted)]]
+        ended = not ended_elsewhere(state, self.time)
+        last = [~torch.stack(earlier).any(0) | ended for _ in self._last]
+        return [reached.unsqueeze(1) for reached in (*earlier, *last)]
 
     def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         """As of `Observed`; of the frames that were reached, in a colony that is grown for a part
         of its time only, as a first look of `Racing`."""
         found = self.statistics(state, history)
         assert history is not None  # statistics need it
-        apart = (found - found.new_tensor(self.values)) / found.new_tensor(self.spread)
+        apart = self.apart(found)
         parts = apart.split([len(f.values) for f in self.frames], 1)
         reached = self._reached(state, history)
         kept = torch.cat([torch.where(r, x, 0.0) for r, x in zip(reached, parts, strict=True)], 1)
@@ -270,10 +292,12 @@ class ObservedCourse(Observed):
     @property
     def evidence(self) -> dict[str, tuple[float, float]]:
         found = {}
+        ranges = self.bounds
         for name, value, spread in zip(self.plan.names, self.values, self.spread, strict=True):
             log = name.startswith(LOG_CELLS)
             size = math.exp(value) if log else 1.0
-            found[_plain(name)] = (size, size * spread) if log else (value, spread)
+            if name not in ranges:
+                found[_plain(name)] = (size, size * spread) if log else (value, spread)
         return found
 
     def why_undefined(self, measure: str) -> str:
@@ -295,6 +319,15 @@ class ObservedCourse(Observed):
         many = f"{self.colonies} observed colon" + ("ies" if self.colonies > 1 else "y")
         groups = dict.fromkeys(g for f in self.frames for g in f.plan.groups)
         return f"like {many} at {times} h, {self.cells} cells: {', '.join(groups)}"
+
+
+def ending_at(data: Observed, end: float) -> Observed:
+    """The same data of colonies that go on until `end` h."""
+    if data.time in (None, end):
+        return data
+    made = object.__new__(ObservedCourse)
+    made._set(data.frames if isinstance(data, ObservedCourse) else (data,), end)
+    return made
 
 
 def _plain(name: str) -> str:
@@ -334,6 +367,9 @@ def _measured(
     if not isinstance(functions, Mapping) or not functions:
         raise checks.input_error(f"{call}: functions", functions, rule)
     moments = checks.vector(f"{call}: times", times)
+    if min(moments, default=1.0) <= 0.0:
+        hint = "Leave such readings out: a scene's founders and `initial=` say how colonies begin."
+        raise checks.input_error(f"{call}: times", list(moments), "above 0 h", hint)
     columns = {}
     for option, given in (("values", values), ("spread", spread)):
         if not hasattr(given, "keys") or set(given.keys()) != set(functions):

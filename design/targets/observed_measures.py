@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -11,7 +12,6 @@ import torchfilm as tf
 from design.targets.base import Target
 from design.targets.measured import Measured
 from design.targets.observed import Observed
-from torchfilm import checks
 
 
 @dataclass(frozen=True)
@@ -35,21 +35,16 @@ class MeasureStatistics:
 @dataclass(frozen=True, init=False)
 class ObservedMeasures(Observed):
     """The wanted values of `measured` as data: each was measured with an error, normal, whose
-    standard deviation is its spread. Simulations get such errors, too.
-
-    Raises InputError for a range in place of a value.
-    """
+    standard deviation is its spread. Simulations get such errors, too. A range is no data; a search
+    takes it all the same."""
 
     plan: MeasureStatistics  # type: ignore[assignment]
     measured: Measured = field(repr=False)
 
     def __init__(self, measured: Measured):
-        values = []
-        for name, (low, high) in measured.wanted.items():  # type: ignore[misc]
-            if low != high:
-                rule = "one number, as data have one"
-                raise checks.input_error(f"Measured.wanted[{name!r}]", (low, high), rule)
-            values.append(low)
+        ends = (measured.wanted[name] for name in measured.functions)
+        # of a range an end that is a number
+        values = [low if math.isfinite(low) else min(high, 1e300) for low, high in ends]  # type: ignore[misc]
         spread = tuple(float(measured.spread[name]) for name in measured.functions)
         code = tf.digest(dict(measured.functions))
         found = {
@@ -63,6 +58,10 @@ class ObservedMeasures(Observed):
         }
         for name, value in found.items():
             object.__setattr__(self, name, value)
+
+    @property
+    def wanted(self) -> tuple[tuple[float, float], ...]:
+        return tuple(self.measured.wanted[name] for name in self.plan.names)  # type: ignore[misc]
 
     @property
     def fewest(self) -> int:  # type: ignore[override]

@@ -163,9 +163,10 @@ def test_one_time_ends_a_colony():
 
 def test_data_of_two_times_within_goals_are_refused_under_conditions():
     at = lambda time: Measured({"bulk": bulk}, {"bulk": 0.5}, {"bulk": 0.1}, time=time)
-    two = Conditions([({"decay": 1.0}, Weighted([(at(1.0), 1.0)])), ({"decay": 2.0}, at(2.0))])
-    with pytest.raises(tf.InputError, match="data of 1, 2 h, and all colonies end at one time"):
-        Task(colony, MAKE, two, **OPTIONS)
+    with pytest.raises(
+        tf.InputError, match="of one time: others are observed until 2 h"
+    ):
+        Conditions([({"decay": 1.0}, Weighted([(at(1.0), 1.0)])), ({"decay": 2.0}, at(2.0))])
 
 
 def seen(time, colonies) -> Observed:
