@@ -163,9 +163,7 @@ def test_one_time_ends_a_colony():
 
 def test_data_of_two_times_within_goals_are_refused_under_conditions():
     at = lambda time: Measured({"bulk": bulk}, {"bulk": 0.5}, {"bulk": 0.1}, time=time)
-    with pytest.raises(
-        tf.InputError, match="of one time: others are observed until 2 h"
-    ):
+    with pytest.raises(tf.InputError, match="of one time: others are observed until 2 h"):
         Conditions([({"decay": 1.0}, Weighted([(at(1.0), 1.0)])), ({"decay": 2.0}, at(2.0))])
 
 

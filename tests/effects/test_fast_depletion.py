@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ import torch
 import torchfilm as tf
 from torchfilm.effects.circuit_words import together_lines
 from torchfilm.signals import joint
+from torchfilm.tools.ragged import Groups
 
 F64 = torch.float64
 FAST, VOXELS = 1.4e6, 8
@@ -118,3 +120,24 @@ def left_of(k):
 def test_it_is_explained():
     assert "in parts of a step while cells take over 2 %" in together_lines({"drug": 1e3})[1]
     assert "in parts" not in " ".join(together_lines({"drug": 100.0}))
+
+
+def test_which_colonies_are_coarse():
+    """Those that took backward Euler and took more than 2 % of what there was, in the geometric
+    mean with the change; whether that was a fall, or a rise in spite of it; not one with nothing
+    to take."""
+    voxels = 4
+    owner = torch.arange(5).repeat_interleave(voxels)
+    content = lambda values: torch.tensor(values, dtype=F64).repeat_interleave(voxels) / voxels
+    before, after = content([1.0, 1.0, 1.0, 1.0, 1e-9]), content([0.9, 0.9, 1.1, 0.999, 5e-10])
+    taken = torch.tensor([0.1, 0.1, 0.1, 0.1, 5e-10], dtype=F64)
+    grid = SimpleNamespace(
+        owner=owner, voxel_volume=1.0, batches=[SimpleNamespace(colonies=torch.arange(5))]
+    )
+    given = SimpleNamespace(
+        groups=Groups(torch.arange(5), 5, ordered=True), field=before, grid=grid, finest=1e-6,
+        _far=[torch.tensor([True, False, True, True, True])],
+    )  # fmt: skip
+    moved = joint.Moved(after, taken, taken, taken)
+    found = joint.JointTransport.coarse(given, moved)
+    assert found.tolist() == [True, False, True, False, False]

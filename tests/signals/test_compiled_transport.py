@@ -10,6 +10,7 @@ import torchfilm as tf
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Periodic
 from torchfilm.signals.grid import Grid
 from torchfilm.signals.transport import COMPILED, Carrier, carry, prepare
+from torchfilm.signals.transport_iterative import Unsplit
 from torchfilm.signals.transport_rates import build_operator
 from torchfilm.signals.transport_series import MOST
 from torchfilm.tools.checks import InputError
@@ -329,3 +330,72 @@ def test_gradients_of_a_colony_have_the_same_bits_beside_one_that_is_solved(dtyp
 
     alone, beside = found(3.0), found(3.0, 1e5)
     assert all(torch.equal(a, b) for a, b in zip(alone, beside, strict=True))
+
+
+def test_a_colony_that_does_not_diffuse_beside_others():
+    """What reaches the other end of a periodic axis is that of each colony; so are sources, and a
+    colony in which nothing moves at all stays as it is."""
+    for method in ("series", "exponential"):
+        op = build_operator(
+            (6, 5, 1), (1.0, 1.0, 1.0), diffusion=torch.tensor([0.0, 20.0, 3e4, 2e4]), decay=0.0,
+            boundary=BoundaryConditions(x=Periodic(), y=Periodic()), colonies=4,
+            source=torch.tensor([0.0, 1.0, 2.0, 5.0]), dtype=torch.float64,
+        )  # fmt: skip
+        if method == "exponential":
+            op = build_operator(
+                (6, 5, 1), (1.0, 1.0, 1.0), diffusion=torch.tensor([0.0, 20.0]), colonies=2,
+                source=torch.tensor([0.0, 1.0]), dtype=torch.float64,
+            )  # fmt: skip
+        u = torch.rand(op.colonies, 6, 5, 1, dtype=torch.float64, generator=torch.Generator())
+        stepper = prepare(op, 0.7, method)
+        ours, theirs = by_kernel(stepper, u), stepper.step(u)
+        assert torch.allclose(ours, theirs, rtol=1e-9)
+        assert torch.allclose(ours[0], u[0], rtol=1e-14)
+        gained = (ours - u).sum((1, 2, 3)) / (0.7 * 30)
+        assert gained.tolist() == pytest.approx([0.0, 1.0, 2.0, 5.0][: len(gained)], rel=1e-9)
+
+
+def test_tangents_of_what_comes_back_are_carried_and_mixtures_refused():
+    """Forward over reverse through an affine step was 0 by kernels; and of a solve that carries
+    tangents the gradient was."""
+    op = of_colonies([3.0, 5.0], BOUNDARIES["periodic"])
+    u = torch.rand(2, 6, 5, 1, dtype=torch.float64).requires_grad_()
+    found = []
+    for step in (
+        lambda x: by_kernel(prepare(op, 0.7, "series"), x),
+        prepare(op, 0.7, "series").step,
+    ):
+        with forward_mode():
+            factor = with_tangent(*torch.tensor([2.0, 1.0], dtype=torch.float64).unbind())
+            (slope,) = torch.autograd.grad(factor * (step(u) ** 2).sum(), u)
+            found.append((slope.detach(), tangent(slope).detach()))
+    assert all(torch.allclose(a, b, rtol=1e-12) for a, b in zip(*found, strict=True))
+    assert float(found[0][1].abs().max()) > 0
+    far = prepare(of_colonies([1e4, 3e4], BOUNDARIES["closed"]), 1.0, "series")
+    with forward_mode():
+        factor = with_tangent(*torch.tensor([2.0, 1.0], dtype=torch.float64).unbind())
+        with pytest.raises(RuntimeError, match="no second derivatives through a solve"):
+            torch.autograd.grad(factor * (far.step(u) ** 2).sum(), u)
+        decay = torch.tensor(0.1, dtype=torch.float64).requires_grad_()
+        both = with_tangent(decay, torch.ones_like(decay))
+        mixed = build_operator(
+            (6, 5, 1), (1.0, 1.0, 1.0), diffusion=1e4, decay=both, colonies=2, dtype=torch.float64
+        )
+        with pytest.raises(RuntimeError, match="passes tangents or gradients, and here both"):
+            prepare(mixed, 1.0, "series").step(u)
+
+
+def test_a_gradient_whose_solve_does_not_converge_is_no_number(monkeypatch):
+    """Of that colony alone."""
+    far = prepare(of_colonies([1e4, 3e4], BOUNDARIES["closed"]), 1.0, "series", compiled=False)
+    u = torch.rand(2, 6, 5, 1, dtype=torch.float64).requires_grad_()
+    loss = (far.step(u) ** 2).sum()
+    solved = Unsplit._solved
+
+    def one_fails(*given, **more):
+        found, good = solved(*given, **more)
+        return found, good & torch.tensor([True, False])
+
+    monkeypatch.setattr(Unsplit, "_solved", one_fails)
+    (slope,) = torch.autograd.grad(loss, u)
+    assert bool(slope[0].isfinite().all()) and bool(slope[1].isnan().all())

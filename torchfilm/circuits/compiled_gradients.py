@@ -64,7 +64,7 @@ class _Step(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad: Tensor):
-        refuse_second("the stiff method of circuits")
+        refuse_second("the stiff method of circuits", grad)
         (slopes,) = ctx.saved_tensors
         found = torch.zeros(slopes.shape[:2], dtype=slopes.dtype)
         # in the order of the variables, which fixes the bits

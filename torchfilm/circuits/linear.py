@@ -72,7 +72,7 @@ class _LinearSolve(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad: Tensor):
-        refuse_second("the stiff method of circuits")
+        refuse_second("the stiff method of circuits", grad)
         lu, x = ctx.saved_tensors
         y = substitute_transposed(lu, grad)
         return -y.unsqueeze(1) * x.unsqueeze(0), None, y

@@ -85,33 +85,58 @@ def add_sides(of_sides, back, term, strides, lengths):
             above[i] += back[i] * term[i + stride if at < length - 1 else i - around]
 
 
+@kernel
+def put_firsts(firsts, terms, pad, grid, more, u):
+    """The first term of each block of as many as `terms` has rows; the terms of the last block are
+    left to `put_block`."""
+    held = terms.shape[0]
+    for i in range(u.size):
+        firsts[0, pad + i] = u[i]
+    for block in range(1, firsts.shape[0]):
+        put_block(firsts, terms, pad, grid, more, block - 1, held)
+        put_next(terms[held - 1], firsts[block], pad, grid, more)
+
+
+@kernel
+def put_block(firsts, terms, pad, grid, more, block, many):
+    """The first `many` terms of a block."""
+    terms[0, :] = firsts[block]
+    for k in range(1, many):
+        put_next(terms[k - 1], terms[k], pad, grid, more)
+
+
 @kernel(entry=True)
 def pull(
-    begin, end, strides, lengths, mixing, turned, gain, rows, u, of_sums, of_u, of_gain, of_stay,
-    of_sides,
+    begin, end, strides, lengths, mixing, turned, gain, rows, u, of_sums, held, of_u, of_gain,
+    of_stay, of_sides,
 ):  # fmt: skip
     """The gradients of `add_up` by u, by the gain and by the entries of P, for those of the sums,
     of_sums (sums, b, voxels).
 
-    turned: Pᵀ, as mixing. of_u: (b, voxels). of_gain, of_stay: (b or 0, voxels), of_sides: (b or 0,
-    2 axes, voxels), with no rows where they are not wanted.
+    turned: Pᵀ, as mixing. held: terms that are held at once, beside one of so many. of_u: (b,
+    voxels). of_gain, of_stay: (b or 0, voxels), of_sides: (b or 0, 2 axes, voxels), with no rows
+    where they are not wanted.
     """
     size, pad, last = u.shape[1], padding_of(strides), rows.shape[1] - 1
-    terms, buffers = np.zeros((max(1, last), size + 2 * pad)), np.zeros((2, size + 2 * pad))
     wants_sides = of_sides.shape[0] > 0
+    wants_terms = last > 0 and (of_stay.shape[0] > 0 or wants_sides)
+    blocks = (last + held - 1) // held if wants_terms else 1
+    firsts, buffers = np.zeros((blocks, size + 2 * pad)), np.zeros((2, size + 2 * pad))
+    terms = np.zeros((held if wants_terms else 1, size + 2 * pad))
     for c in range(begin, end):
         grid, back_grid = grid_of(c, strides, mixing), grid_of(c, strides, turned)
         more, none = gained_by(c, gain, u[c]), u[c, :0]
-        if of_stay.shape[0] > 0 or wants_sides:
-            for i in range(size):
-                terms[0, pad + i] = u[c, i]
-            for k in range(1, last):
-                put_next(terms[k - 1], terms[k], pad, grid, more)
+        if wants_terms:
+            put_firsts(firsts, terms, pad, grid, more, u[c])
         back, new = buffers[0], buffers[1]
         back[:] = 0.0
         put_pulled(back[pad : pad + size], rows, last, c, of_sums)
         for k in range(last - 1, -1, -1):
-            inner, term = back[pad : pad + size], terms[k, pad : pad + size]
+            block, place = k // held, k % held
+            if wants_terms and (k == last - 1 or place == held - 1):
+                put_block(firsts, terms, pad, grid, more, block, place + 1)
+            inner = back[pad : pad + size]
+            term = terms[place if wants_terms else 0, pad : pad + size]
             if of_gain.shape[0] > 0:
                 for i in range(size):
                     of_gain[c, i] += inner[i]

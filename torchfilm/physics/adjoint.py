@@ -102,7 +102,7 @@ class _AdjointFunction(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad: Tensor):
-        refuse_second("contacts")
+        refuse_second("contacts", grad)
         solve_again, _ = kept(ctx)
         with one_torch_thread():  # its many small operations would wait for others
             return -solve_again(grad.contiguous()), None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,15 +16,15 @@ from torchfilm.tools.numba_calls import unavailable
 from torchfilm.tools.tangents import no_derivatives
 from torchfilm.tools.threads import Shared
 
-# Numbers of all terms of a colony up to which kernels hold them on the way back.
+# Numbers of all terms of a colony up to which kernels hold them on the way back. Of more they hold
+# the root of their number, and go through them once more.
 MOST_HELD = 2**24
 _added, _pulled = Shared(), Shared()
 
 
-def may_add_up(u: Tensor, terms: int) -> bool:
-    """Whether kernels may do it: u (b, nx, ny, nz)."""
-    held = terms * u[0].numel() if u.shape[0] else 0
-    return u.device.type == "cpu" and not unavailable() and held <= MOST_HELD
+def may_add_up(u: Tensor) -> bool:
+    """Whether kernels may do it, whatever the batch: they add up in another order than torch."""
+    return u.device.type == "cpu" and not unavailable()
 
 
 def add_up(mixing: Mixing, gain: Tensor | None, rows: Tensor, u: Tensor) -> tuple[Tensor, ...]:
@@ -55,7 +56,8 @@ def pull(
     out.append(made(sides, 2 * axes, size))
     numbers = (
         _grids(gain, u), rows.contiguous().numpy(), _flat(u),
-        torch.stack([x.flatten(1) for x in of_sums]).numpy(), *(x.numpy() for x in out),
+        torch.stack([x.flatten(1) for x in of_sums]).numpy(), _held(rows.shape[1] - 1, size),
+        *(x.numpy() for x in out),
     )  # fmt: skip
     with subnormals.as_zero():
         _pulled(
@@ -66,6 +68,11 @@ def pull(
     each = of_sides.unbind(1) if sides else [None] * (2 * axes)
     found += [None if x is None else x.reshape(u.shape) for x in each]
     return of_u.view(u.shape), found
+
+
+def _held(terms: int, size: int) -> int:
+    """How many terms are held at once."""
+    return max(1, terms if terms * size <= MOST_HELD else math.isqrt(terms) + 1)
 
 
 def _arrays(mixing: Mixing, u: Tensor) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchfilm.signals import compiled_sums
 from torchfilm.signals.compiled_sums import may_add_up
 from torchfilm.signals.mixing import Mixing
-from torchfilm.tools.tangents import in_forward_mode, may_be_checkpoint
+from torchfilm.tools.tangents import has_tangent, in_forward_mode, may_be_checkpoint
 
 # Numbers of all terms up to which a backward pass keeps them, for others that may follow. A longer
 # series is gone through once more in a backward pass, and as many as the root of its terms held.
@@ -34,7 +34,7 @@ def sums(
     if in_forward_mode() or not torch.is_grad_enabled() or not any(x.requires_grad for x in values):
         return _by_terms(mixing, gain, rows, u)
     dims = tuple(dim for dim, _, _ in mixing.gains)
-    compiled = compiled and may_add_up(u, len(rows[0]))
+    compiled = compiled and may_add_up(u)
     return _Sums.apply(dims, compiled, torch.stack(tuple(rows)), u, gain, *mixing.numbers)
 
 
@@ -87,7 +87,7 @@ class _Sums(torch.autograd.Function):
     def backward(ctx, *of_sums: Tensor):
         rows, u, gain, stay, *sides = ctx.saved_tensors
         mixing, wanted = _mixing(ctx.dims, stay, sides), ctx.needs_input_grad[4:]
-        if ctx.compiled and not torch.is_grad_enabled():
+        if ctx.compiled and not torch.is_grad_enabled() and not has_tangent(*of_sums):
             back, found = compiled_sums.pull(mixing, gain, rows, u, of_sums, wanted)
         else:
             back, found = _pulled(ctx, mixing, gain, rows, u, of_sums, wanted)

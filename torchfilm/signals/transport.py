@@ -145,7 +145,9 @@ class _Carried(torch.autograd.Function):
     def backward(ctx, back: Tensor):
         grid, kernels, adjoints = ctx.given
         if not torch.is_grad_enabled():
-            return _run(grid, adjoints, back), None, None, None
+            value, moved = both(back)
+            turned = None if moved is None else _run(grid, adjoints, moved)
+            return with_tangent(_run(grid, adjoints, value), turned), None, None, None
         linear = [kernel.linear() for kernel in kernels]
         if None in linear:
             refuse_second("a solve of transport")

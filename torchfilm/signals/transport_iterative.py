@@ -22,7 +22,7 @@ from torchfilm.signals.transport_operator import Operator, apply
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.segments import keep, kept
-from torchfilm.tools.tangents import both, refuse_second, with_tangent
+from torchfilm.tools.tangents import both, in_forward_mode, refuse_both, refuse_second, with_tangent
 from torchfilm.tools.threads import one_torch_thread
 
 Map = Callable[[Tensor], Tensor]
@@ -141,6 +141,8 @@ class Unsplit:
         right = wide if self.theta == 1 else wide + (1 - self.theta) * self.dt * linear(wide)
         if self.operator.gain is not None:
             right = right + self.dt * self.operator.gain
+        if in_forward_mode():
+            refuse_both("a solve of transport", right, left(wide))
         with torch.no_grad():
             bare = lambda x: both(x)[0]
             still = lambda x: bare(left(x))
@@ -179,7 +181,7 @@ class _KrylovAdjoint(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad: Tensor):
-        refuse_second("a solve of transport")
+        refuse_second("a solve of transport", grad)
         (forward, of), _ = kept(ctx)
         left, symmetric = forward, of.operator.symmetric
         if not symmetric and not of.by_kernels:

@@ -19,6 +19,7 @@ from torchfilm.tools.tangents import (
     both,
     in_forward_mode,
     may_be_checkpoint,
+    refuse_both,
     refuse_second,
     with_tangent,
 )
@@ -204,6 +205,7 @@ def with_derivative(
     at = x.detach().requires_grad_(not again)
     value = function(with_tangent(x, torch.zeros_like(x)) if in_forward_mode() else at)
     moved = both(value)[1]
+    refuse_both(what, value)
     if moved is not None:  # F′ of a tangent, and the tangent of F itself, together
         size = _sizes(moved, groups)
         turned = fixed_point(
@@ -231,7 +233,7 @@ class _Adjoint(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad: Tensor):
         (function, groups, (close, most, what), known), (x,) = kept(ctx)
-        refuse_second(what)
+        refuse_second(what, grad)
         if known is not None:
             at, value = known
         else:

@@ -103,6 +103,16 @@ def both(value: Tensor) -> tuple[Tensor, Tensor | None]:
     return found.primal.detach(), found.tangent
 
 
+def refuse_both(what: str, *given: Tensor) -> None:
+    """Raise RuntimeError where these numbers carry a tangent and require a gradient, too: `what`
+    gives one of the two, and the other would be lost."""
+    if torch.is_grad_enabled() and has_tangent(*given) and any(x.requires_grad for x in given):
+        raise RuntimeError(
+            f"{what} passes tangents or gradients, and here both are wanted: run forward mode in"
+            " torch.no_grad(), or leave tangents out."
+        )
+
+
 def with_tangent(value: Tensor, moved: Tensor | None) -> Tensor:
     """The tensor with a tangent, where there is one."""
     return value if moved is None else forward_ad.make_dual(value, moved)
@@ -119,10 +129,11 @@ def scaled(value: Tensor, factor: Tensor | float) -> Tensor:
     return with_tangent(plain * factor, moved * factor)
 
 
-def refuse_second(what: str) -> None:
-    """Raise RuntimeError in a backward pass that is to be differentiated again: its own graph is
-    not kept, so that second derivatives would be wrong."""
-    if torch.is_grad_enabled():
+def refuse_second(what: str, *back: Tensor | None) -> None:
+    """Raise RuntimeError in a backward pass that is to be differentiated again, or in which what
+    comes back carries a tangent: its own graph is not kept, so that second derivatives would be
+    wrong."""
+    if torch.is_grad_enabled() or has_tangent(*back):
         raise RuntimeError(
             f"there are no second derivatives through {what}: leave out create_graph=True, or take"
             " differences of gradients."
