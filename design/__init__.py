@@ -11,6 +11,7 @@ from design.finals import Finals
 from design.front import Front
 from design.growing import FinishedColonies
 from design.inference import infer
+from design.intervals import Intervals
 from design.library import Library, Sensor, SensorDevice, Wiring
 from design.methods import (
     CMAES,
@@ -83,6 +84,7 @@ __all__ = [
     "Front",
     "Gradient",
     "Image",
+    "Intervals",
     "Lasting",
     "Library",
     "Local",

@@ -12,6 +12,7 @@ import torchfilm as tf
 from design import report, report_plot
 from design.finals import FreshLosses
 from design.growing import FinishedColonies
+from design.intervals import Intervals, intervals_of
 from design.objective import Objective
 from design.parameters import Value
 from design.robustness_check import check_robustness
@@ -127,6 +128,13 @@ class Best:
     def table(self) -> str:
         """The parameters with their bounds and the first guess, the losses and the measures."""
         return displays.Text(report.table(self._report()))
+
+    def intervals(self) -> Intervals:
+        """How well the data tell the parameters, as least squares have it: from the derivatives of
+        all readings at the best fit, in one more run. `table()` of it, `interval(level)` and
+        `correlation`. Raises InputError where the target is no data, or has no exact
+        derivatives."""
+        return intervals_of(self.objective, self.point, self.values, self.searched_loss)
 
     def colonies(self) -> list[FinishedColonies]:
         """The replicates at their ends, grown again once: the same colonies as were scored."""

@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import torchfilm as tf
+from design.fit_plot import Curve, draw_readings, measures_of
 from design.targets.observed import Observed
+from design.targets.readings import readings_of
 from torchfilm import checks
+
+LIKELY = 3.0  # a loss of simulations above that of a right model and a posterior as it should be
+WIDE = (
+    ", of a right model and a narrow posterior about 2: give infer more simulations, or change the"
+    " model. Where a search has exact derivatives, its best.intervals() needs no simulations."
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -67,10 +77,27 @@ class Prediction:
             lines.append(line + ("  outside" if out else ""))
         expected = (1 - level) * len(self.observed.values)
         lines.append(f"{outside} outside; {expected:.1f} are to be expected")
-        lines.append(f"loss of a simulation, median: {np.median(self.losses):.3g}")
+        loss = float(np.median(self.losses))
+        lines.append(f"loss of a simulation, median: {loss:.3g}" + (WIDE if loss > LIKELY else ""))
         if self.failed:
             lines.append(f"{self.failed} simulations failed and are left out")
         return tf.displays.Text("\n".join(lines))
+
+    def plot(self, out: str | Path | None = None) -> tf.pictures.Picture:
+        """Draw measured numbers, and the middle 90 % of the predicted ones, over time or dose. out:
+        as for `Best.plot`. Needs matplotlib (the `app` extra). Raises InputError where cells were
+        observed, and not numbers: `table()` lists these."""
+        readings = readings_of(getattr(self.observed, "conditions", self.observed))
+        if not readings:
+            rule = "of measured numbers: Measured, a course or conditions of these"
+            raise checks.input_error("observed", self.observed.describe(), rule, "Print table().")
+        ends = np.quantile(self.statistics, [0.5, 0.05, 0.95], axis=0).T.tolist()
+        values = {n: (a, b, c) for n, (a, b, c) in zip(self.places, ends, strict=True)}
+        panels = len(measures_of(readings))
+        figure = tf.pictures.new_figure(3.8 * panels, 3.6)
+        axes: Any = figure.subplots(1, panels, squeeze=False)[0]
+        draw_readings(axes, readings, [Curve("predicted, 90 %", "-", values)])
+        return tf.pictures.Picture(figure, out)
 
     def __repr__(self) -> str:
         return f"Prediction({len(self.statistics)} simulations of {len(self.places)} statistics)"

@@ -11,17 +11,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import torchfilm as tf
+from design.fit_plot import Curve, draw_readings, measures_of, spread_over
 from design.growing import FinishedColonies
 from design.parameters import Parameter, show_value
 from design.report import (
     SearchReport,
     best_trivial,
+    each_measured,
     misses_constraints,
     shown_loss,
     trivial_answers,
 )
 from design.targets.base import OUTSIDE, Target, known
 from design.targets.goals import Constrained
+from design.targets.readings import DataPoint, readings_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,7 +39,34 @@ WIDE = 100.0
 
 def draw(report: SearchReport) -> Figure:
     """Draw the first guess above and the best design below, with the target over each colony, and
-    the course of the search beside them. Needs matplotlib (the `app` extra)."""
+    the course of the search beside them; of measured numbers, these and the fit. Needs matplotlib
+    (the `app` extra)."""
+    readings = readings_of(report.task.target)
+    figure, aside = _draw_fit(report, readings) if readings else _draw_designs(report)
+    _draw_convergence(figure.add_subplot(aside[0]), report)
+    _draw_parameters(figure.add_subplot(aside[1]), report)
+    return figure
+
+
+def _draw_fit(report: SearchReport, readings: Sequence[DataPoint]) -> tuple[Figure, Any]:
+    """The readings and what the best design and the first guess have there; the figure, and where
+    the rest goes."""
+    target, panels = report.task.target, len(measures_of(readings))
+    figure = tf.pictures.new_figure(3.4 * panels + 4.2, 4.8)
+    title = f"best, {shown_loss(target, report.best.loss)}"
+    figure.suptitle(f"fit of {len(readings)} readings: {title}", fontsize=10)
+    grid = figure.add_gridspec(2, panels + 1, width_ratios=[1.3] * panels + [1.5])
+    curves = [
+        Curve(one.title, line, spread_over(each_measured(target, one.colonies)))
+        for one, line in ((report.best, "-"), (report.first, ":"))
+    ]
+    axes = [figure.add_subplot(grid[:, k]) for k in range(panels)]
+    draw_readings(axes, readings, curves)
+    return figure, (grid[0, panels], grid[1, panels])
+
+
+def _draw_designs(report: SearchReport) -> tuple[Figure, Any]:
+    """The colonies of the first guess and the best design; the figure, and where the rest goes."""
     designs = (report.first, report.best)
     target, conditions = report.task.target, report.task.conditions
     shown = SHOWN if conditions == 1 else min(conditions, MOST_SHOWN)
@@ -73,9 +103,7 @@ def draw(report: SearchReport) -> Figure:
         tf.pictures.colour_bar(bar, replace(scale, unit=unit, beyond="max" if over else "neither"))
     for bar in bars[len(scales) :]:
         bar.set_visible(False)
-    _draw_convergence(figure.add_subplot(grid[0, columns]), report)
-    _draw_parameters(figure.add_subplot(grid[1:, columns]), report)
-    return figure
+    return figure, (grid[0, columns], grid[1:, columns])
 
 
 def draw_colonies(

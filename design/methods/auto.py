@@ -19,6 +19,8 @@ BATCH, WIDTH = 24, 0.5
 # designs before the first descents (less than one race, whose end they await), and for each
 # parameter of a descent, so that it ends
 BEFORE, EACH, MOST_STARTS = 5, 10, 3
+# designs before the descent of a fit whose budget has no room for a whole batch
+SPARSE = 8
 # designs of a batch of a race where every design needs many replicates
 FEW = 12
 # designs of a batch of a model, and at most in a search, since its time grows as the cube of all
@@ -71,9 +73,7 @@ def choose(
     about = f"{(whole := math.floor(designs))} designs for {dimensions} parameters"
     hint = "" if botorch or designs > most else " (with botorch, a model of the loss would)"
     few = Chosen(
-        cloud,
-        f"{whole} designs are fewer than {least}, too few to learn much from; its first batch is of"
-        " Sobol points",
+        cloud, f"{whole} designs are fewer than {least}, too few to learn from; Sobol points first"
     )
     luck = "molecules are counted one by one, and one colony says little"
     race = Chosen(
@@ -97,8 +97,9 @@ def choose(
             f"{about}: {luck if pattern else data}; a model of the loss knows that colonies differ"
             " by luck",
         )
-    descents, fits = _descents(cloud, about), _fits(cloud, data)
-    known = (few, race, *descents, *fits, *((learnt, modelled) if botorch else ()))
+    descents, fits = _descents(cloud, about), _fits(cloud, data, BATCH)
+    sparse = _fits(CMAES(population=SPARSE, sigma=WIDTH), data, SPARSE)[:1]
+    known = (few, race, *descents, *fits, *sparse, *((learnt, modelled) if botorch else ()))
     every = Chosen(Exhaustive(), f"{different:g} different designs: the budget grows each")
     if begun := [x for x in (*known, every) if x.describe() == before]:
         return Chosen(begun[0].method, "the study began with it")
@@ -108,10 +109,10 @@ def choose(
         return every
     if designs < least:
         return few
-    ways, first = (descents, BEFORE) if pattern else (fits, BATCH)
-    room = int(((designs if pattern else searched or designs) - first) / (EACH * dimensions))
-    if squares and room > 0 and not chance and (designs >= LEAST_RACED or not pattern):
-        return ways[min(room, MOST_STARTS) - 1]
+    ways = (descents, ()) if pattern else (fits, sparse)
+    grown = designs if pattern else searched or designs
+    if squares and not chance and (way := _by_slopes(dimensions, designs, grown, *ways)):
+        return way
     if designs > most or not botorch:
         return race if pattern else fit
     return modelled if alone else learnt
@@ -123,6 +124,24 @@ def _least_modelled(dimensions: int, replicates: int, alone: bool) -> int:
     if alone:
         return Bayesian(batch=MODEL_BATCH).opening(dimensions) + MODEL_BATCH
     return math.ceil((EARLY / replicates + FINALISTS) / SEARCHED)
+
+
+def _by_slopes(
+    dimensions: int,
+    designs: float,
+    grown: float,
+    ways: tuple[Chosen, ...],
+    sparse: tuple[Chosen, ...],
+) -> Chosen | None:
+    """The descents for which a budget has room, from one start and from more; None where it has
+    none. grown: designs before the finals. ways: those of patterns, or of fits; sparse: of a fit
+    after few designs."""
+    first = BATCH if sparse else BEFORE
+    room = int((grown - first) / (EACH * dimensions))
+    if room > 0 and (sparse or designs >= LEAST_RACED):
+        return ways[min(room, MOST_STARTS) - 1]
+    # half a descent comes further than a model of so few designs
+    return sparse[0] if sparse and designs >= SPARSE + EACH * dimensions / 2 else None
 
 
 def _descents(cloud: CMAES, about: str) -> tuple[Chosen, ...]:
@@ -137,12 +156,12 @@ def _descents(cloud: CMAES, about: str) -> tuple[Chosen, ...]:
     )
 
 
-def _fits(cloud: CMAES, data: str) -> tuple[Chosen, ...]:
+def _fits(cloud: CMAES, data: str, after: int) -> tuple[Chosen, ...]:
     """Descents of a fit to data, from one start and from more, side by side."""
     return tuple(
         Chosen(
-            Polish(inner=cloud, after=BATCH, starts=starts),
-            f"{data}; {BATCH} designs of CMA-ES, then by gradients from the best, since the loss is"
+            Polish(inner=cloud, after=after, starts=starts),
+            f"{data}; {after} designs of CMA-ES, then by gradients from the best, since the loss is"
             " a sum of squares with exact derivatives",
         )
         for starts in range(1, MOST_STARTS + 1)

@@ -295,3 +295,19 @@ def test_a_search_that_found_what_was_wanted_says_nothing_of_descents(capsys):
     search = Search(lit, TWO, LASTING, cells=8, replicates=2, method=Local(), finals=None)
     search.run(400, stop_at=1e8)
     assert "first descent" not in capsys.readouterr().err
+
+
+def test_auto_descends_in_fits_of_few_designs():
+    """Half a descent comes further than a model of so few designs, which left a fit of four
+    constants by 60 designs at losses of 70 to 240, and this one at 1e-8."""
+    fit = partial(choose, pattern=False, squares=True, replicates=1)
+    of = lambda chosen: (chosen.method.after, chosen.method.starts)
+    assert of(fit(4, 60, 0, searched=48)) == (8, 1)
+    assert of(fit(4, 28, 0, searched=22)) == (8, 1)
+    assert isinstance(fit(4, 27, 0, searched=22).method, Bayesian)
+    assert of(fit(4, 80, 0, searched=64)) == (24, 1)
+    assert of(fit(4, 400, 0, searched=320)) == (24, 3)
+    # a study that began so goes on so
+    begun = fit(4, 60, 0, searched=48).describe()
+    assert of(fit(4, 400, 0, searched=320, before=begun)) == (8, 1)
+    assert not isinstance(fit(4, 60, 0, squares=False, searched=48).method, Polish)
