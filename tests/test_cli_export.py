@@ -58,7 +58,7 @@ def test_every_format(run, tmp_path, capsys):
         assert (tmp_path / "a.nwk").read_text() == tree.to_newick(1)
         assert export("a.lineage.csv") == ["a.lineage.csv"]
         header, *rows = (tmp_path / "a.lineage.csv").read_text().splitlines()
-        assert header.endswith("fate,birth_length,end_length") and len(rows) == len(tree)
+        assert header.endswith("fate,birth_length,end_length,cell_type") and len(rows) == len(tree)
         assert export("a.graphml") == ["a.graphml"]
         graph = networkx.read_graphml(tmp_path / "a.graphml")
         assert len(graph) == len(tree)

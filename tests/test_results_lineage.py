@@ -7,6 +7,7 @@ import re
 import h5py
 import numpy as np
 import pytest
+import torch
 from helpers import step
 from recorded import DT, make_scene, record
 
@@ -77,7 +78,7 @@ def test_each_cell_has_its_length_at_birth_and_at_its_end(whole):
     removed = [name for name, k in row.items() if tree.fate[k] == "removed"]
     assert removed and all(last[name] == tree.end_length[row[name]] for name in removed)
     table = tree.to_pandas()
-    assert list(table.columns[-2:]) == ["birth_length", "end_length"] and len(table) == len(tree)
+    assert list(table.columns[-2:]) == ["end_length", "cell_type"] and len(table) == len(tree)
 
 
 def test_a_file_of_an_earlier_version_has_no_lengths_and_goes_on(tmp_path):
@@ -85,6 +86,7 @@ def test_a_file_of_an_earlier_version_has_no_lengths_and_goes_on(tmp_path):
     record(scene, scene.bind(2, seed=3).start(), path, until=1.0)
     with h5py.File(path, "r+") as file:
         del file["lineage/births/length"], file["lineage/ends/length"]
+        del file["lineage/ends/cell_type"]
         file.attrs["version"] = 2
     with tf.Results(path) as results:
         state = results.state(scene)
@@ -94,6 +96,40 @@ def test_a_file_of_an_earlier_version_has_no_lengths_and_goes_on(tmp_path):
         tree = results.lineage()
     assert len(tree) > state.cells and np.isnan(tree.birth_length[tree.parent >= 0]).all()
     assert np.isnan(tree.end_length).all()
+
+
+def test_each_cell_has_its_type_also_where_no_frame_has_it(tmp_path):
+    """Cells of type 1 become type 2 from 0.5 h on, and burst; most live between frames."""
+
+    def ages(cells):
+        if cells.time >= 0.5:
+            cells.cell_type = torch.where(cells.cell_type == 1, 2, cells.cell_type)
+
+    founders = tf.Cells([[0.0, 0.0], [9.0, 0.0]], [[1.0, 0.0]] * 2, cell_type=[0, 1])
+    scene = tf.Scene(
+        tf.Rules(ages),
+        tf.Growth(rate=1.5), tf.Division(length=3.0),
+        tf.Lysis(rate={0: 0.0, 1: 0.0, 2: 20.0}), founders=founders, dt=0.05,
+    )  # fmt: skip
+    path = tmp_path / "types.h5"
+    seen: dict[int, int] = {}
+    for state in tf.simulate(scene, until=1.0, record=tf.Recorder(path, scene, every=100)):
+        seen |= dict(zip(state.uid.tolist(), state.cell_type.tolist(), strict=True))
+    with tf.Results(path) as results:
+        tree = results.lineage()
+        in_frames = np.concatenate([results.frame(k)["uid"] for k in range(len(results.times))])
+    lysed = tree.fate == "lysed"
+    assert lysed.any() and (tree.cell_type[lysed] == 2).all()
+    assert not np.isin(tree.cell[lysed], in_frames).all()
+    assert (tree.cell_type >= 0).all() and set(tree.cell_type) == {0, 1, 2}
+    others = ~lysed  # a cell may change its type in the step in which it ends
+    assert tree.cell_type[others].tolist() == [seen[c] for c in tree.cell[others].tolist()]
+    assert tree.to_pandas().cell_type.tolist() == tree.cell_type.tolist()
+    plain = tmp_path / "plain.h5"
+    for _ in tf.simulate(tf.Scene(tf.Growth(rate=1.0), dim=2), until=0.1, record=plain):
+        pass
+    with tf.Results(plain) as results:
+        assert results.lineage().cell_type.tolist() == [-1]
 
 
 @pytest.mark.parametrize("fraction, warns", [(0.5, False), (0.4, True)])

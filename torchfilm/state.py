@@ -15,7 +15,7 @@ from torchfilm import state_colonies
 from torchfilm.physics import capsule
 from torchfilm.physics.space import PeriodicSpace
 from torchfilm.signals.layout import Contact, Layout, Signals
-from torchfilm.state_colonies import CELL, COLONY, GRID, PER_COLONY
+from torchfilm.state_colonies import CELL, COLONY, GRID, PER_COLONY, Ended, note_of
 from torchfilm.tools import checks, displays, random, row_checks, tangents
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.read_only import read_only
@@ -83,16 +83,6 @@ class Births:
     def parents(self) -> State:
         """The parents, M cells, as they were."""
         return self.before.take(self.rows)
-
-
-@dataclass(frozen=True)
-class Ended:
-    """Cells that left in one step: why, of `FATES`; and colony ids, uids and lengths (M,)."""
-
-    fate: str
-    colony_id: Tensor
-    uid: Tensor
-    length: Tensor
 
 
 MAPPINGS = ("fields", "declared", "reports")  # parts that are kept as views that cannot change
@@ -338,8 +328,7 @@ class State:
         if not bool(gone.any()):
             return self
         lost, kept = torch.nonzero(gone).squeeze(1), torch.nonzero(~gone).squeeze(1)
-        note = Ended(fate, *(x[lost] for x in (self.own_colony_id, self.uid, self.length)))
-        return self.take(kept).replace(ended=(*self.ended, note))
+        return self.take(kept).replace(ended=(*self.ended, note_of(self, lost, fate)))
 
     def select(self, colonies: row_checks.Rows) -> State:
         """Some colonies of the batch, by their places, in the order given. Each goes on as it would

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -16,6 +17,26 @@ if TYPE_CHECKING:
 
 CELL, COLONY, GRID = "cell", "colony", "grid"
 PER_COLONY = ("colony_id", "stream", "next_uid")
+
+
+@dataclass(frozen=True)
+class Ended:
+    """Cells that left in one step: why, of `FATES`; and colony ids, uids and lengths (M,), and
+    their types, None in a scene without types."""
+
+    fate: str
+    colony_id: Tensor
+    uid: Tensor
+    length: Tensor
+    cell_type: Tensor | None
+
+
+def note_of(state: State, rows: Tensor, fate: str) -> Ended:
+    """That the cells `rows` (M,) of a state leave."""
+    colony = state.colony_id.index_select(0, state.colony.index_select(0, rows))
+    uid, length = (x.index_select(0, rows) for x in (state.uid, state.length))
+    kind = state.fields.get("cell_type")
+    return Ended(fate, colony, uid, length, None if kind is None else kind.index_select(0, rows))
 
 
 def selected(state: State, places: Tensor) -> State:

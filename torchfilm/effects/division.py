@@ -23,7 +23,8 @@ from torchfilm.effects.compiled_division import (
 from torchfilm.effects.division_lengths import CAPS, least_length, smaller_shares, without_short
 from torchfilm.physics import capsule
 from torchfilm.resolver import Resolved, Values
-from torchfilm.state import CELL, Births, Ended, Field, State
+from torchfilm.state import CELL, Births, Field, State
+from torchfilm.state_colonies import note_of
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets, repeated
 from torchfilm.tools.reads import numbers, rows_where
@@ -341,8 +342,7 @@ def divide(
     first, second = daughters.chunk(2)
     uid, length = (x.index_select(0, daughters) for x in (new.uid, new.length))
     births = Births(first, second, uid, length, state, rows)
-    colony_id = state.colony_id.index_select(0, state.colony.index_select(0, rows))
-    note = Ended("divided", colony_id, state.uid[rows], state.length[rows])
+    note = note_of(state, rows, "divided")
     at = new.position if new.space is None else new.space.inside(new.position)
     new = new.replace(births=(*new.births, births), ended=(*new.ended, note), position=at)
     if by_kernels and fresh is not None:

@@ -58,9 +58,10 @@ CHUNK_BYTES = 1024  # of the tables that are not compressed
 BLANK = {"f": np.nan, "i": -1}  # between frames, by the kind of dtype
 LINEAGE = {
     "births": ("colony_id", "uid", "parent", "step", "length", "time"),
-    "ends": ("colony_id", "uid", "step", "fate", "length", "time"),
+    "ends": ("colony_id", "uid", "step", "fate", "length", "time", "cell_type"),
 }
-LINEAGE_NUMBERS = ("length", "time")  # µm and h; older files lack one or both
+LINEAGE_NUMBERS = ("length", "time")  # µm and h
+LINEAGE_LATER = (*LINEAGE_NUMBERS, "cell_type")  # older files lack some
 # step last: it commits the frame
 FRAME_COLUMNS = ("first_row", "counts", "next_uid", "births", "ends", "time", "step")
 

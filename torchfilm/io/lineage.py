@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
-from torchfilm.io.layout import LINEAGE, LINEAGE_NUMBERS
+from torchfilm.io.layout import LINEAGE, LINEAGE_LATER, LINEAGE_NUMBERS
 from torchfilm.io.reading import blaming_file, committed, read_dataset
 from torchfilm.io.table import Tables, data_frame, needed
 from torchfilm.state import FATES
@@ -22,17 +22,18 @@ if TYPE_CHECKING:
 
 COLUMNS = (
     "colony", "cell", "parent", "sister", "founder", "generation", "pole_age", "born", "ended",
-    "fate", "birth_length", "end_length",
+    "fate", "birth_length", "end_length", "cell_type",
 )  # fmt: skip
 RELATIONS = ("mother", "sister", "cousin")
 
 
 def _column(file: h5py.File, name: str, count: int) -> np.ndarray:
-    """The first rows of a table's column; NaN where an older file does not have it."""
+    """The first rows of a table's column; NaN, or −1, where an older file does not have it."""
+    column = name.split("/")[-1]
     with blaming_file(file, name):
-        lacks = name.split("/")[-1] in LINEAGE_NUMBERS and bool(file) and name not in file
+        lacks = column in LINEAGE_LATER and bool(file) and name not in file
     if lacks:
-        return np.full(count, np.nan)
+        return np.full(count, np.nan if column in LINEAGE_NUMBERS else -1)
     return read_dataset(file, name, slice(count))
 
 
@@ -47,8 +48,9 @@ class Lineage:
     run, and that of cells which a run found in the middle of another is not known, NaN · ended: h,
     NaN while it lives · fate: "alive", "divided", "removed", "left", "lysed", "eroded", "sloughed"
     or "failed" · birth_length, end_length: of the centreline, µm, when it was born and ended; NaN
-    where that hour is NaN, and in files of earlier versions but for founders · founder: uid of the
-    first of its line in the file.
+    where that hour is NaN, and in files of earlier versions but for founders · cell_type: when it
+    ended, or in the last frame while it lives; −1 in a scene without types, and of ends in files of
+    earlier versions · founder: uid of the first of its line in the file.
 
     Cells are named by uid, and in a run of several colonies by `colony`, an id, too. `course` reads
     the file, which must be open. Raises InputError for cells and colonies that the run does not
@@ -91,6 +93,12 @@ class Lineage:
             )
         self.fate[at] = np.asarray(FATES)[ends["fate"]]
         self.end_length[at] = ends["length"]
+        self.cell_type = np.full(len(self.cell), -1)
+        last = results.frame(self.frames - 1)
+        if "cell_type" in last:
+            alive = self._rows(results.colony_id[last["colony"]], last["uid"])
+            self.cell_type[alive] = last["cell_type"]
+        self.cell_type[at] = ends["cell_type"]
 
     def __len__(self) -> int:
         return len(self.cell)
@@ -101,7 +109,7 @@ class Lineage:
 
     def to_pandas(self) -> Any:
         """A pandas.DataFrame with one row per cell: colony, cell, parent, sister, founder,
-        generation, pole_age, born, ended, fate, birth_length, end_length."""
+        generation, pole_age, born, ended, fate, birth_length, end_length, cell_type."""
         return data_frame({name: getattr(self, name) for name in COLUMNS})
 
     def born_of(self, colony: np.ndarray, cell: np.ndarray) -> np.ndarray:

@@ -311,7 +311,8 @@ class Recorder(metaclass=checks.KnownKeywords):
             steps, times = (np.full(e.uid.numel(), x) for x in (state.step, state.time))
             fates = np.full(e.uid.numel(), FATES.index(e.fate))
             own = (numpy_of(x) for x in (e.colony_id, e.uid))
-            self.ends.append((*own, steps, fates, numpy_of(e.length), times))
+            types = np.full_like(steps, -1) if e.cell_type is None else numpy_of(e.cell_type)
+            self.ends.append((*own, steps, fates, numpy_of(e.length), times, types))
 
     def _write(self, state: State) -> None:
         assert self.file is not None
@@ -390,12 +391,8 @@ class Recorder(metaclass=checks.KnownKeywords):
         for name, value in found_columns(state).items():
             self._append(f"{AT_CELLS}/{name}", value, first_row)
         for table, events in (("births", self.births), ("ends", self.ends)):
-            names = LINEAGE[table]
-            merged = (
-                [np.concatenate(c) for c in zip(*events, strict=True)]
-                if events
-                else [np.empty(0, np.int64)] * len(names)
-            )
+            names, none = LINEAGE[table], np.empty(0, np.int64)
+            merged = [np.concatenate(c) for c in zip(*events, strict=True)] or [none] * len(names)
             for name, value in zip(names, merged, strict=True):
                 if f"lineage/{table}/{name}" in file:  # older files have no lengths, or times
                     self._append(f"lineage/{table}/{name}", value, sizes[table])

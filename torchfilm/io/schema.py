@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
-from torchfilm.io.layout import AT_CELLS, LINEAGE, LINEAGE_NUMBERS
+from torchfilm.io.layout import AT_CELLS, LINEAGE, LINEAGE_LATER
 from torchfilm.tools.checks import InputError
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ DATASETS = {
         f"lineage/{t}/{n}": (WHOLE, 1)
         for t in LINEAGE
         for n in LINEAGE[t]
-        if n not in LINEAGE_NUMBERS
+        if n not in LINEAGE_LATER
     },
 }
 GRID = {"origin": (NUMBER, 3), "shape": (WHOLE, 3), "first_voxel": (WHOLE, 1)}
