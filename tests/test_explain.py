@@ -430,3 +430,14 @@ def test_what_voxels_add_to_diffusion_where_it_flows(speed):
     variance = lambda s: mean(s, (x - mean(s, x)) ** 2)
     grown = (variance(last) - variance(first)) / (2 * 0.2)
     assert grown - 10.0 == pytest.approx(float(found[1]), rel=0.02)
+
+
+@pytest.mark.parametrize(("spacing", "said"), [(2.0, False), (1.0, True)])
+def test_voxels_finer_than_cells_are_said(spacing, said):
+    """A round cell exchanges with the voxels about its centre, and starved on finer ones."""
+    large = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], length=0.0, radius=2.0)
+    food = tf.Signal(diffusion=200.0, initial=0.5)
+    medium = tf.Medium(food=food, box=((-16, -16), (16, 16)), spacing=spacing, depth=4.0)
+    scene = tf.Scene(tf.Monod("food"), tf.Growth(), medium, founders=large, dt=0.02)
+    words = "are finer than cells, of radii up to 2 µm"
+    assert (words in " ".join(tf.explain(scene, seconds=0).split())) == said

@@ -61,6 +61,24 @@ def test_shares_of_types():
     assert np.bincount(tf.inoculum(3, 30.0, types={0: 0.5, 1: 0.5}).cell_type).sum() == 3
 
 
+@pytest.mark.parametrize(("dim", "floor"), [(2, None), (3, 1.0)])
+def test_sizes_of_types(dim, floor):
+    """Round cells of 2 µm beside rods; none overlap, and on a floor each lies on it."""
+    founders = tf.inoculum(
+        20, 20.0, types={0: 0.8, 1: 0.2}, cell_radius={0: 0.5, 1: 2.0},
+        length={0: tf.Uniform(2, 4), 1: 0.0}, colonies=2, dim=dim, floor=floor, seed=3,
+    )  # fmt: skip
+    large = founders.cell_type == 1
+    assert int(large.sum()) == 8 and set(founders.radius[large].tolist()) == {2.0}
+    assert set(founders.radius[~large].tolist()) == {0.5}
+    rods = founders.length[~large]
+    assert bool((founders.length[large] == 0).all()) and len(set(rods.tolist())) == 32
+    assert 2 <= float(rods.min()) < float(rods.max()) <= 4
+    assert len(founders.overlaps()) == 0
+    if floor is not None:
+        assert np.allclose(founders.position[:, 2], floor + founders.radius)
+
+
 def test_a_colony_is_the_same_among_others():
     one = tf.inoculum(12, radius=12.0, types={0: 0.5, 1: 0.5}, seed=4)
     many = tf.inoculum(12, radius=12.0, types={0: 0.5, 1: 0.5}, colonies=3, seed=4)
@@ -103,6 +121,11 @@ def test_colonies_grow_from_it():
         ({"length": [[1.0], [1.0, 2.0]]}, "one length for each of the 30 cells"),
         ({"length": "2"}, "length = '2' is not allowed"),
         ({"fractions": {0: 1.0}}, "no parameter 'fractions'"),
+        ({"length": {0: 1.0}}, r"length = \{0: 1.0\}.*one number where there are no types.*types="),
+        ({"length": {0: 1.0}, "types": {0: 0.5, 1: 0.5}}, "a value for each of the types 0, 1"),
+        ({"cell_radius": {0: 1.0, 1: 0.0}, "types": {0: 0.5, 1: 0.5}}, r"cell_radius\[1\] = 0"),
+        ({"length": {0: 1.0, 1: -1.0}, "types": {0: 0.5, 1: 0.5}}, r"length\[1\] = -1"),
+        ({"length": {0: tf.Uniform(-1, 1)}, "types": {0: 1.0}}, r"length\[0\].low = -1"),
     ],
 )
 def test_what_is_no_inoculum(given, words):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,8 +26,8 @@ def inoculum(
     types: Mapping[int, float] | None = None,
     colonies: int = 1,
     dim: int = 2,
-    length: float | Uniform | Sequence[float] | np.ndarray | Tensor = 2.0,
-    cell_radius: float = 0.5,
+    length: float | Uniform | Sequence[float] | np.ndarray | Tensor | Mapping[int, Any] = 2.0,
+    cell_radius: float | Mapping[int, float] = 0.5,
     floor: float | None = None,
     seed: int = 0,
 ) -> Cells:
@@ -37,10 +38,11 @@ def inoculum(
     radius: of the disc, in 3-D the ball, that contains their centres, µm. types: the share of each
     cell type, which together are 1; each colony has these shares, as near as whole numbers of cells
     come to them, and who is of which type is drawn. dim: 2 or 3. length: of the centreline, µm: one
-    number; tf.Uniform(2, 4) to draw each, since cells of one length divide all at once; or one for
-    each of `count` cells, the same in all colonies. cell_radius: µm. floor: in 3-D, µm: cells lie
-    flat on a floor at this z, in a disc around the z axis, instead of in a ball. No two cells
-    overlap. Colony k is the same whatever their number.
+    number; tf.Uniform(2, 4) to draw each, since cells of one length divide all at once; a dict of
+    these by type, {0: 2.0, 1: tf.Uniform(0, 1)}; or one for each of `count` cells, the same in all
+    colonies. cell_radius: µm, one number, or a dict by type. floor: in 3-D, µm: cells lie flat on a
+    floor at this z, in a disc around the z axis, instead of in a ball. No two cells overlap. Colony
+    k is the same whatever their number.
     Raises InputError for shares that do not sum to 1, and where the cells do not find room: rods
     placed one after the other at random fill at most about 45 % of an area, 30 % of a volume.
     """
@@ -48,40 +50,77 @@ def inoculum(
     checks.number("radius", radius, least=0.0)
     checks.integer("colonies", colonies, least=1)
     checks.choice("dim", dim, (2, 3))
-    lengths = _lengths(length, count, colonies, seed)
-    checks.number("cell_radius", cell_radius, above=0.0)
     checks.integer("seed", seed, least=0)
+    shares = _shares(types)
+    kinds = np.stack(
+        [_types(np.random.default_rng([seed, k, 1]), count, shares) for k in range(colonies)]
+    )
+    lengths = _lengths(length, kinds, shares, seed)
+    radii = _radii(cell_radius, kinds, shares)
     if floor is not None:
         checks.number("floor", floor)
         if dim == 2:
             raise checks.input_error("floor", floor, "left out with dim=2", "Take dim=3.")
-    shares, placed_in = _shares(types), 2 if floor is not None else dim
+    placed_in = 2 if floor is not None else dim
     made = [
-        _colony(np.random.default_rng([seed, k]), radius, placed_in, lengths[k], cell_radius)
+        _colony(np.random.default_rng([seed, k]), radius, placed_in, lengths[k], radii[k])
         for k in range(colonies)
     ]
     if floor is not None:
-        made = [_lying(*placed, floor + cell_radius) for placed in made]
-    kinds = [_types(np.random.default_rng([seed, k, 1]), count, shares) for k in range(colonies)]
+        made = [_lying(*placed, floor + own) for placed, own in zip(made, radii, strict=True)]
     return Cells(
         np.concatenate([position for position, _ in made]),
         np.concatenate([axis for _, axis in made]),
         lengths.reshape(-1),
-        cell_radius,
-        cell_type=None if shares is None else np.concatenate(kinds),
+        radii.reshape(-1),
+        cell_type=None if shares is None else kinds.reshape(-1),
         colony=None if colonies == 1 else np.repeat(np.arange(colonies), count),
     )
 
 
-def _lengths(given: object, count: int, colonies: int, seed: int) -> np.ndarray:
-    """The length of each cell, (colonies, count), checked."""
+def _by_type(name: str, given: Mapping[int, Any], shares: Mapping[int, float] | None) -> None:
+    """Raises InputError unless the dict has a value for each type, and no others."""
+    kinds = () if shares is None else tuple(shares)
+    if {*given} != {*kinds}:
+        rule = f"a value for each of the types {', '.join(map(str, kinds))}"
+        hint = "Give their shares, such as types={0: 0.9, 1: 0.1}."
+        rule = "one number where there are no types" if shares is None else rule
+        raise checks.input_error(name, dict(given), rule, hint if shares is None else "")
+
+
+def _radii(
+    given: float | Mapping[int, float], kinds: np.ndarray, shares: Mapping[int, float] | None
+) -> np.ndarray:
+    """The radius of each cell, of the shape of their `kinds`, checked."""
+    if not isinstance(given, Mapping):
+        return np.full(kinds.shape, checks.number("cell_radius", given, above=0.0))
+    _by_type("cell_radius", given, shares)
+    found = np.empty(kinds.shape)
+    for kind, value in given.items():
+        found[kinds == kind] = checks.number(f"cell_radius[{kind}]", value, above=0.0)
+    return found
+
+
+def _lengths(
+    given: object, kinds: np.ndarray, shares: Mapping[int, float] | None, seed: int
+) -> np.ndarray:
+    """The length of each cell, of the shape of their `kinds`, (colonies, count), checked."""
+    colonies, count = kinds.shape
     if isinstance(given, Uniform):
-        low = checks.number("length.low", given.low, least=0.0)
-        high = checks.number("length.high", given.high, least=0.0)
-        draws = (np.random.default_rng([seed, k, 2]).random(count) for k in range(colonies))
-        return low + (high - low) * np.stack(list(draws))
+        return _drawn("length", given, kinds, seed)
     rule = f"a number, tf.Uniform(2, 4), or one length for each of the {count} cells"
-    if isinstance(given, Distribution | Mapping | str):
+    if isinstance(given, Mapping):
+        _by_type("length", given, shares)
+        found = np.empty(kinds.shape)
+        for kind, value in given.items():
+            name, mine = f"length[{kind}]", kinds == kind
+            found[mine] = (
+                _drawn(name, value, kinds, seed)[mine]
+                if isinstance(value, Uniform)
+                else checks.number(name, value, least=0.0)
+            )
+        return found
+    if isinstance(given, Distribution | str):
         raise checks.input_error("length", given, rule)
     if isinstance(given, Tensor):
         given = given.detach().cpu().numpy()
@@ -94,6 +133,15 @@ def _lengths(given: object, count: int, colonies: int, seed: int) -> np.ndarray:
     if each.shape != (count,) or not (each >= 0).all() or not np.isfinite(each).all():
         raise checks.input_error("length", given, f"{rule}, each finite and at least 0")
     return np.tile(each, (colonies, 1))
+
+
+def _drawn(name: str, given: Uniform, kinds: np.ndarray, seed: int) -> np.ndarray:
+    """A length for each cell, of the shape of their `kinds`."""
+    low = checks.number(f"{name}.low", given.low, least=0.0)
+    high = checks.number(f"{name}.high", given.high, least=0.0)
+    colonies, count = kinds.shape
+    draws = (np.random.default_rng([seed, k, 2]).random(count) for k in range(colonies))
+    return low + (high - low) * np.stack(list(draws))
 
 
 def _shares(types: object) -> dict[int, float] | None:
@@ -125,9 +173,10 @@ def _types(rng: np.random.Generator, count: int, shares: dict[int, float] | None
 
 
 def _colony(
-    rng: np.random.Generator, radius: float, dim: int, length: np.ndarray, cell_radius: float
+    rng: np.random.Generator, radius: float, dim: int, length: np.ndarray, cell_radius: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and axes of the cells of a colony, (count, dim) each; length: (count,)."""
+    """Positions and axes of the cells of a colony, (count, dim) each; length, cell_radius:
+    (count,)."""
     count = len(length)
     position, axis = np.empty((count, dim)), np.empty((count, dim))
     again = np.arange(count)
@@ -139,36 +188,37 @@ def _colony(
         again = _overlapping(position, axis, length, cell_radius, again)
         if not again.size:
             return position, axis
-    mean = length.mean()
+    wide = " or ".join(f"{r:g}" for r in np.unique(cell_radius))
     raise checks.input_error(
         "radius", radius, "wide enough for the cells",
-        f"{count} cells of length {mean:g} and radius {cell_radius:g} µm would fill"
-        f" {_filled(count, radius, dim, mean, cell_radius):.0%} of it, and did not find room in"
+        f"{count} cells of length {length.mean():g} and radius {wide} µm would fill"
+        f" {_filled(radius, dim, length, cell_radius):.0%} of it, and did not find room in"
         f" {ROUNDS} rounds: give a greater radius, or fewer cells.",
     )  # fmt: skip
 
 
-def _filled(count: int, radius: float, dim: int, length: float, cell_radius: float) -> float:
+def _filled(radius: float, dim: int, length: np.ndarray, cell_radius: np.ndarray) -> float:
     """The share of the disc, or the ball, that cells fill; those at its rim stick out of it."""
     across, around = 2.0 * length * cell_radius, np.pi * cell_radius**2
+    whole = radius + float(cell_radius.max())
     if dim == 2:
-        return count * (across + around) / (np.pi * (radius + cell_radius) ** 2)
+        return float((across + around).sum()) / (np.pi * whole**2)
     volume = around * (length + 4.0 / 3.0 * cell_radius)
-    return count * volume / (4.0 / 3.0 * np.pi * (radius + cell_radius) ** 3)
+    return float(volume.sum()) / (4.0 / 3.0 * np.pi * whole**3)
 
 
-def _lying(position: np.ndarray, axis: np.ndarray, z: float) -> tuple[np.ndarray, np.ndarray]:
-    """Cells of the plane in space, at this height."""
-    column = np.full((len(position), 1), z)
+def _lying(position: np.ndarray, axis: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cells of the plane in space, at these heights (count,)."""
+    column = z[:, None]
     return np.hstack([position, column]), np.hstack([axis, 0.0 * column])
 
 
 def _overlapping(
-    position: np.ndarray, axis: np.ndarray, length: np.ndarray, radius: float, new: np.ndarray
+    position: np.ndarray, axis: np.ndarray, length: np.ndarray, radius: np.ndarray, new: np.ndarray
 ) -> np.ndarray:
     """Which of the `new` cells overlap one that was there, or a new one before them."""
     count = len(position)
-    wide = torch.full((count,), radius, dtype=torch.float64)
+    wide = torch.from_numpy(radius)
     one = torch.zeros(count, dtype=torch.int64)
     first, second, gap = gaps_nearby(
         torch.from_numpy(position), torch.from_numpy(axis), torch.from_numpy(length), wide, one, 1

@@ -221,7 +221,15 @@ class BoundMedium(_MediumPart):
 
     def numerics(self, dt: float, state: State) -> list[str]:
         moved = self.transport.in_turns, self.transport.coupled
-        return self.effect.numerics(dt, state, *moved, found=self.found)
+        lines = self.effect.numerics(dt, state, *moved, found=self.found)
+        finest, radius = min(self.effect.spacing), float(state.radius.max()) if state.cells else 0.0
+        if radius > finest and self.found != frozenset():
+            lines.append(
+                f"voxels of {finest:g} µm are finer than cells, of radii up to {radius:g} µm: each"
+                " exchanges with those about its centre alone, so that it finds too little of what"
+                " it takes, the less the finer they are"
+            )
+        return lines
 
 
 class GridCoverage(_MediumPart):
