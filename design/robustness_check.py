@@ -15,8 +15,13 @@ from design.parameters import Choice, Parameter, Space, Value
 from design.progress import advance, open_bar
 from design.robustness import ParameterChange, Resized, Robustness
 from design.sensitivity import loss_indices
+from design.targets.base import Target
+from design.targets.several import observed_at
+from design.task import Task
 from design.variation import varied
 from torchfilm import checks
+
+USUAL = (0.5, 2.0)  # sizes of colonies beside the searched one
 
 
 class ScoredDesign(Protocol):
@@ -40,7 +45,7 @@ def check_robustness(
     best: ScoredDesign,
     *,
     seeds: int = 32,
-    sizes: Sequence[float] = (0.5, 2.0),
+    sizes: Sequence[float] | None = None,
     change: float = 0.2,
     vary: float = 0.0,
     samples: int = 0,
@@ -53,27 +58,28 @@ def check_robustness(
 
     seeds: streams of random numbers, those right after the searched ones (with R replicates: R … R
     + seeds − 1). Every part of the check uses the same streams, so that differences are due to what
-    is changed. sizes: further colony sizes, as shares of the one searched, above 1 too. change:
-    each parameter alone at value·(1 ± change), or at the bound that this exceeds; a whole number at
-    its neighbours, a choice at each other option. vary: all parameters at once, as where parts are
-    uncertain: as many variants as seeds, each number times its own exp(vary · normal number),
-    within its bounds, on four of the streams in turn; 0 leaves them out. samples: a power of two,
-    for Sobol' indices over the whole space (Saltelli et al. 2010; scipy.stats.sobol_indices) of the
-    mean loss on the searched streams, where a failed colony counts with its loss. They cost
-    samples·(D + 2)·R colonies; 0 leaves them out. threshold: a loss that is good enough; the result
-    gives the share of seeds that reach it. executor, work_items: as in `Objective.evaluate`. Raises
-    InputError for an argument that is not allowed.
+    is changed. sizes: further colony sizes, as shares of the one searched, above 1 too; by default
+    0.5 and 2, and none where colonies end when data were observed. change: each parameter alone at
+    value·(1 ± change), or at the bound that this exceeds; a whole number at its neighbours, a
+    choice at each other option. vary: all parameters at once, as where parts are uncertain: as many
+    variants as seeds, each number times its own exp(vary · normal number), within its bounds, on
+    four of the streams in turn; 0 leaves them out. samples: a power of two, for Sobol' indices over
+    the whole space (Saltelli et al. 2010; scipy.stats.sobol_indices) of the mean loss on the
+    searched streams, where a failed colony counts with its loss. They cost samples·(D + 2)·R
+    colonies; 0 leaves them out. threshold: a loss that is good enough; the result gives the share
+    of seeds that reach it. executor, work_items: as in `Objective.evaluate`. Raises InputError for
+    an argument that is not allowed.
     """
     if not isinstance(getattr(best, "objective", None), Objective):
         raise checks.input_error("best", best, "the design that a search returned, a Best")
     checks.integer("work_items", work_items, least=1)
+    sizes = _sizes(best.objective.task.target, sizes)
     _check_arguments(seeds, sizes, change, vary, samples, threshold)
     objective, task = best.objective, best.objective.task
     searched, dimensions = task.replicates, task.space.size
     streams = tuple(range(searched, searched + seeds))
     changes, points = _changed_points(task.space, best, change)
-    moved = (points != best.point).any(1)
-    moved[0] = True
+    moved = (points != best.point).any(1) | (np.arange(len(points)) == 0)
     cost = samples * (dimensions + 2) * searched
     run: dict[str, Any] = {"executor": executor, "work_items": work_items}
     note = f"{cost} for {samples} samples of {dimensions} parameters" if samples else ""
@@ -85,8 +91,7 @@ def check_robustness(
         losses[moved] = found.losses
         resized = []
         for share in sizes:
-            other = Objective(task.resized(share))
-            resized.append(_resized(other, share, best.point, streams, executor, work_items))
+            resized.append(_resized(task.resized(share), share, best.point, streams, **run))
             advance(bar, seeds * share)
         at_once = varied(objective, best.point, float(vary), streams, **run) if vary else None
         advance(bar, seeds if vary else 0)
@@ -108,6 +113,17 @@ def check_robustness(
     )
 
 
+def _sizes(target: Target, given: Sequence[float] | None) -> Sequence[float]:
+    """The further sizes of colonies: data of one time do not compare with others."""
+    seen = observed_at(target)
+    if given is None:
+        return USUAL if seen is None else ()
+    if seen is not None and len(given):
+        rule = f"left out, since the data were observed at {seen:g} h"
+        raise checks.input_error("sizes", given, rule)
+    return given
+
+
 def _changed_points(
     space: Space, best: ScoredDesign, change: float
 ) -> tuple[list[tuple[int, Value, Value]], np.ndarray]:
@@ -123,17 +139,10 @@ def _changed_points(
 
 
 def _resized(
-    objective: Objective,
-    share: float,
-    point: np.ndarray,
-    streams: tuple[int, ...],
-    executor: Executor | None,
-    work_items: int,
+    task: Task, share: float, point: np.ndarray, streams: tuple[int, ...], **run: Any
 ) -> Resized:
-    found = objective.evaluate(
-        point[None], streams=streams, executor=executor, work_items=work_items
-    )
-    return Resized(float(share), objective.task.cells, objective.task.until, found.losses[0])
+    found = Objective(task).evaluate(point[None], streams=streams, **run)
+    return Resized(float(share), task.cells, task.until, found.losses[0])
 
 
 def _check_arguments(

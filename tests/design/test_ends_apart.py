@@ -175,3 +175,13 @@ def test_minutes_for_hours(more):
         return
     with pytest.warns(UserWarning, match=r"until = 120 h.*10\^42 cells.*Are times in hours"):
         make()
+
+
+def test_a_check_grows_data_to_no_other_size():
+    """Half and twice the hours had losses of a failed colony."""
+    search = Search(washout, SPACE, course((1.0, 2.0), (level(1.0), level(2.0))), replicates=1)
+    best = search.run(colonies=12, progress=False)
+    found = best.check(seeds=1, progress=False)
+    assert found.sizes == () and len(found.losses) == 1
+    with pytest.raises(tf.InputError, match=r"sizes = \(0\.5,\).*data were observed at 2 h"):
+        best.check(seeds=1, sizes=(0.5,), progress=False)
