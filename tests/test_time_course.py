@@ -80,3 +80,29 @@ def test_colonies_that_die_leave_the_picture_and_many_have_no_bands(run):
 def test_bad_input(run, names, options, words):
     with pytest.raises(tf.InputError, match=words):
         tf.pictures.time_course(run, *names, **options)
+
+
+def test_cells_of_each_type_are_counted_apart(tmp_path):
+    founders = tf.Cells(
+        [[0.0, 0.0], [20.0, 0.0]] * 2, [[1.0, 0.0]] * 4, cell_type=[0, 1] * 2, colony=[0, 0, 1, 1]
+    )
+    scene = tf.Scene(tf.Growth(rate={0: 2.0, 1: 0.5}), tf.Division(length=4.0), founders=founders)
+    path = tmp_path / "types.h5"
+    states = list(tf.simulate(scene, until=1.0, dt=0.1, record=path))
+    picture = tf.pictures.time_course(path, "length", by="cell_type")
+    cells, lengths = picture.figure.axes
+    labels = [line.get_label() for line in cells.lines]
+    assert labels == [f"colony {c}, cell_type {k}" for c in (0, 1) for k in (0, 1)]
+    assert [line.get_linestyle() for line in cells.lines] == ["-", "-", "--", "--"]
+    colours = [line.get_color() for line in cells.lines]
+    assert colours[0] == colours[2] != colours[1] == colours[3]
+    last = states[-1]
+    for k, line in enumerate(cells.lines):
+        mine = (last.colony == k // 2) & (last.cell_type == k % 2)
+        assert line.get_ydata()[-1] == int(mine.sum())
+        drawn = lengths.lines[k].get_ydata()[-1]
+        assert drawn == pytest.approx(float(last.length[mine].mean()), rel=1e-5)
+    with pytest.raises(tf.InputError, match="by = 'length'.*a field of whole numbers"):
+        tf.pictures.time_course(path, by="length")
+    with pytest.raises(tf.InputError, match="one of .*cell_type"):
+        tf.pictures.time_course(path, by="cell_typ")

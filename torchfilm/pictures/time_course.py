@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,10 +27,14 @@ BAND = (10.0, 90.0)  # percentiles
 TENFOLD = 10.0  # numbers of cells of such a range are drawn by their logarithms
 
 
+STYLES = ("-", "--", ":", "-.")  # of colonies, where colours are those of kinds
+
+
 @checks.known_keywords
 def time_course(
     what: str | Path | Results,
     *quantities: str,
+    by: str | None = None,
     colonies: Sequence[int] | None = None,
     most: int = 8,
     out: str | Path | None = None,
@@ -39,57 +44,97 @@ def time_course(
     over its cells; of up to four colonies also the band from 10 to 90 % of the cells.
 
     what: a results file, or its path. quantities: fields of the cells, or signals at them as
-    "out.NAME". colonies: their ids; default the first `most` that had cells. out: save the picture
-    there. Raises InputError for a quantity that is not recorded, and for a file of one frame."""
+    "out.NAME". by: a field of whole numbers, such as "cell_type": cells of each are counted apart,
+    a colour for each, and a style of lines for each of up to four colonies. colonies: their ids;
+    default the first `most` that had cells. out: save the picture there. Raises InputError for a
+    quantity that is not recorded, and for a file of one frame."""
     with opened(what) as results:
         check_not_results(results.path, out)
         checked_dpi(dpi)
         if len(results) < 2:
             raise checks.InputError(f"a time course needs two frames, and {results.path} has one")
         frames = RecordedFrames(results, range(len(results)))
+        most = most if by is None else min(most, len(STYLES))
         places, more = choose_colonies(frames.shown(False), results.colony_id, colonies, most)
-        seen = [_seen(results, k, places, quantities) for k in range(len(results))]
+        lines = _lines(results, places, by, frames)
+        seen = np.stack([_seen(results, k, lines, by, quantities) for k in range(len(results))])
         figure = new_figure(WIDE, HIGH * (1 + len(quantities)) + 0.3, dpi)
         axes = figure.subplots(1 + len(quantities), 1, sharex=True, squeeze=False)[:, 0]
-        counts, first = results.counts[:, places], frames[0]
-        labels = [first.name(place) for place in places]
-        colours = _colours(len(places))
-        for k, (label, colour) in enumerate(zip(labels, colours, strict=True)):
-            alive = np.where(counts[:, k] > 0, counts[:, k], np.nan)
-            axes[0].plot(results.times, alive, color=colour, lw=1.2, label=label)
-        _finish(axes[0], "cells", log=counts.max() > TENFOLD * max(1, counts[counts > 0].min()))
+        for k, line in enumerate(lines):
+            drawn: dict[str, Any] = {"color": line.colour, "ls": line.style, "lw": 1.2}
+            counts = seen[:, k, 0, 0]
+            alive = np.where(counts > 0, counts, np.nan)
+            axes[0].plot(results.times, alive, label=line.label, **drawn)
+            for row in range(len(quantities)):
+                mean, low, high = seen[:, k, 1 + row].T
+                axes[1 + row].plot(results.times, mean, **drawn)
+                if len(lines) <= FEW:
+                    axes[1 + row].fill_between(results.times, low, high, color=line.colour,
+                                               alpha=0.2, lw=0)  # fmt: skip
+        counts = seen[:, :, 0, 0]
+        some = counts[counts > 0].min(initial=np.inf)
+        _finish(axes[0], "cells", log=bool(counts.max(initial=0.0) > TENFOLD * max(1, some)))
         for row, name in enumerate(quantities):
-            of_name = np.stack([found[row] for found in seen])  # (frames, colonies, 3)
-            for k, colour in enumerate(colours):
-                mean, low, high = of_name[:, k].T
-                axes[1 + row].plot(results.times, mean, color=colour, lw=1.2)
-                if len(places) <= FEW:
-                    axes[1 + row].fill_between(results.times, low, high, color=colour, alpha=0.2,
-                                               lw=0)  # fmt: skip
             unit = unit_at_cells(results, name)
             _finish(axes[1 + row], f"mean of {name}" + f" ({unit})" * bool(unit))
         axes[-1].set_xlabel("time (h)")
-        if len(results.colony_id) > 1:
+        if len(results.colony_id) > 1 or by is not None:
             axes[0].legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
         figure.suptitle(f"{frames.title}{more}", fontsize=9, parse_math=False)
         return Picture(figure, out)
 
 
+@dataclass(frozen=True)
+class CourseLine:
+    """The cells of a colony at a place of the batch, or those of one kind, and how to draw them."""
+
+    place: int
+    kind: int | None
+    label: str
+    colour: Any
+    style: str
+
+
+def _lines(
+    results: Results, places: Sequence[int], by: str | None, frames: RecordedFrames
+) -> list[CourseLine]:
+    """One for each colony, or for each kind of each."""
+    name = frames[0].name
+    if by is None:
+        colours = _colours(len(places))
+        return [CourseLine(p, None, name(p), c, "-") for p, c in zip(places, colours, strict=True)]
+    if len(places) > len(STYLES):
+        rule = f"up to {len(STYLES)} colonies where cells are told apart by {by!r}"
+        raise checks.input_error("colonies", [name(p) for p in places], rule)
+    columns = [known_quantities(results, k, by)[1][by] for k in range(len(results))]
+    if any(x.dtype.kind not in "iub" for x in columns):
+        raise checks.input_error("by", by, "a field of whole numbers, such as 'cell_type'")
+    kinds = np.unique(np.concatenate(columns)).tolist()
+    several = len(results.colony_id) > 1
+    return [
+        CourseLine(p, kind, f"{name(p)}, {by} {kind}" if several else f"{by} {kind}", c, style)
+        for p, style in zip(places, STYLES, strict=False)
+        for kind, c in zip(kinds, _colours(len(kinds)), strict=True)
+    ]
+
+
 def _seen(
-    results: Results, frame: int, places: Sequence[int], names: Sequence[str]
-) -> list[np.ndarray]:
-    """Of each quantity the mean, and the ends of the band, in each of these colonies, (C, 3); NaN
-    without cells."""
-    cells, known = known_quantities(results, frame, *names)
-    out = []
-    for name in names:
-        found = np.full((len(places), 3), np.nan)
-        for k, place in enumerate(places):
-            mine = known[name][cells["colony"] == place].astype(float)
-            if len(mine):
-                found[k] = mine.mean(), *np.percentile(mine, BAND)
-        out.append(found)
-    return out
+    results: Results, frame: int, lines: Sequence[CourseLine], by: str | None, names: Sequence[str]
+) -> np.ndarray:
+    """Of the cells of each line their number, three times, and of each quantity the mean, and the
+    ends of the band, (lines, 1 + quantities, 3); NaN without cells."""
+    wanted = names if by is None else (*names, by)
+    cells, known = known_quantities(results, frame, *wanted)
+    found = np.full((len(lines), 1 + len(names), 3), np.nan)
+    for k, line in enumerate(lines):
+        mine = cells["colony"] == line.place
+        mine = mine if by is None else mine & (known[by] == line.kind)
+        found[k, 0] = mine.sum()
+        for row, name in enumerate(names):
+            values = known[name][mine].astype(float)
+            if len(values):
+                found[k, 1 + row] = values.mean(), *np.percentile(values, BAND)
+    return found
 
 
 def _colours(count: int) -> list[Any]:
