@@ -34,6 +34,13 @@ def measures_of(readings: Sequence[DataPoint]) -> list[str]:
     return list(dict.fromkeys(r.name for r in readings))
 
 
+def are_curves(readings: Sequence[DataPoint]) -> bool:
+    """Whether they make curves: of several times, or data of several conditions. Of a number alone,
+    and of ranges, such as those of a gate, colonies show more."""
+    times, labels = {r.time for r in readings}, {r.label for r in readings}
+    return len(times) > 1 or (len(labels) > 1 and all(r.low == r.high for r in readings))
+
+
 def spread_over(found: Mapping[str, Sequence[float]]) -> Ends:
     """The mean, the least and the most of each measure over colonies."""
     each = {n: np.array(x, dtype=float) for n, x in found.items()}
@@ -58,7 +65,7 @@ def draw_readings(
         ax.set_xlabel(words)
         ax.set_ylabel(name)
     ranges = any(r.low != r.high for r in readings)
-    _legend(axes[0], curves, "measured or wanted" if ranges else "measured")
+    _legend(axes, curves, "measured or wanted" if ranges else "measured")
 
 
 def _draw_one(
@@ -80,7 +87,8 @@ def _draw_one(
         if not known:
             continue
         x, middle, low, high = (np.array(column) for column in zip(*known, strict=True))
-        ax.plot(x, middle, curve.line, color=colour, lw=1.2, label=label)
+        alone = "_" if len(x) == 1 else ""  # a line of one point is none
+        ax.plot(x, middle, curve.line, marker=alone, ms=12, color=colour, lw=1.2, label=label)
         if (high > low).any():
             ax.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
         label = ""
@@ -101,8 +109,8 @@ def _places(readings: Sequence[DataPoint]) -> tuple[Any, str, bool]:
             zero = f"; 0 at {none:.2g}" if doses[0] <= 0 else ""
             return at, f"log10 {name}{zero}", True
         return lambda r: r.under[name], name, True
-    if None in times:
-        labels = list(dict.fromkeys(r.label for r in readings))
+    labels = list(dict.fromkeys(r.label for r in readings))
+    if None in times or (len(times) == 1 and len(labels) > 1):
         return lambda r: labels.index(r.label), "condition", False
     return lambda r: r.time, "time, h", False
 
@@ -115,12 +123,15 @@ def _colours(count: int) -> list[Any]:
     return [matplotlib.colormaps["viridis"](0.9 * k / (count - 1)) for k in range(count)]
 
 
-def _legend(ax: Axes, curves: Sequence[Curve], points: str) -> None:
+def _legend(axes: Sequence[Axes], curves: Sequence[Curve], points: str) -> None:
     """Conditions by colour, curves by their lines, and what points are."""
     from matplotlib.lines import Line2D
 
-    handles, labels = ax.get_legend_handles_labels()
+    known: dict[str, Any] = {}
+    for ax in axes:  # a condition may have no reading of the first measure
+        known |= {n: x for x, n in zip(*ax.get_legend_handles_labels(), strict=True)}
+    labels, handles = list(known), list(known.values())
     handles += [Line2D([], [], color="0.4", ls=curve.line) for curve in curves]
     handles.append(Line2D([], [], color="0.4", marker="o", ls="", ms=4))
     labels += [tf.displays.shortened(curve.title, 30) for curve in curves]
-    ax.legend(handles, [*labels, points], fontsize=7, frameon=False)
+    axes[0].legend(handles, [*labels, points], fontsize=7, frameon=False)

@@ -13,7 +13,7 @@ import numpy as np
 import torchfilm as tf
 from design.objective import Objective
 from design.parameters import Parameter, Value
-from design.targets.observed_conditions import checked_data
+from design.targets.observed_conditions import data_of
 from torchfilm import checks
 
 UNTOLD = 1e-12  # of the greatest information along a direction; with less nothing is told of it
@@ -101,7 +101,7 @@ def intervals_of(
 ) -> Intervals:
     """See `Best.intervals`. point: (D,) coordinates of the best fit; values, loss: of it."""
     task, space = objective.task, objective.task.space
-    data = checked_data(task.target)
+    readings = sum(len(part.values) for part in data_of(task.target))
     if not objective.least_squares:
         raise checks.InputError(
             "intervals are from exact derivatives by the parameters, and here there are none:"
@@ -110,7 +110,7 @@ def intervals_of(
         )
     found = objective.evaluate(point[None], slopes=True).slopes
     assert found is not None
-    information = 0.5 * len(data.values) * found.curvature[0][np.ix_(space.moving, space.moving)]
+    information = 0.5 * readings * found.curvature[0][np.ix_(space.moving, space.moving)]
     if not np.isfinite(information).all():
         raise checks.InputError("the best design has failed, and has no derivatives.")
     parameters = [space.parameters[k] for k in space.moving]
@@ -119,7 +119,7 @@ def intervals_of(
     size = [math.log(p.high / p.low) if p.log else p.high - p.low for p in known]
     return Intervals(
         known, tuple(float(values[p.name]) for p in known),
-        _inverse(information) * np.outer(size, size), len(data.values), loss,
+        _inverse(information) * np.outer(size, size), readings, loss,
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import torchfilm as tf
-from design.fit_plot import Curve, draw_readings, measures_of, spread_over
+from design.fit_plot import Curve, are_curves, draw_readings, measures_of, spread_over
 from design.growing import FinishedColonies
 from design.parameters import Parameter, show_value
 from design.report import (
@@ -39,10 +39,11 @@ WIDE = 100.0
 
 def draw(report: SearchReport) -> Figure:
     """Draw the first guess above and the best design below, with the target over each colony, and
-    the course of the search beside them; of measured numbers, these and the fit. Needs matplotlib
-    (the `app` extra)."""
+    the course of the search beside them; of numbers measured at several times or doses, these and
+    the fit. Needs matplotlib (the `app` extra)."""
     readings = readings_of(report.task.target)
-    figure, aside = _draw_fit(report, readings) if readings else _draw_designs(report)
+    fits = are_curves(readings)
+    figure, aside = _draw_fit(report, readings) if fits else _draw_designs(report)
     _draw_convergence(figure.add_subplot(aside[0]), report)
     _draw_parameters(figure.add_subplot(aside[1]), report)
     return figure

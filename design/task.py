@@ -26,8 +26,10 @@ from design.scene_family import (
     try_scenes,
     why_rough_together,
 )
-from design.targets.base import Target
+from design.targets.base import Target, inner_targets
 from design.targets.goals import Goals, of_seeds
+from design.targets.measured import Measured
+from design.targets.observed import Observed
 from design.targets.several import observed_at
 from torchfilm import checks
 
@@ -37,6 +39,8 @@ TOO_MANY = 1e8  # cells of a colony
 SHORTEST = 1000  # parts of the first time among which a step is looked for
 # what studies say of the course of a step: losses of another one do not compare
 ORDER = "division at the end"
+# and of the losses of data, likewise
+OF_DATA = "Huber's beyond 100 spreads; all readings alike"
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,8 +181,8 @@ class Task(TaskOptions):
             cells = max(self.tried.founders + 1, round(cells * size))
         if until is not None:
             # a smaller colony must reach the first time at which the target sees it
-            first = min((time for time in self.target.times if time <= until), default=0.0)
-            until = max(max(1, round(until * size / dt)) * dt, first)
+            first = self.target.first_time
+            until = max(max(1, round(until * size / dt)) * dt, first if first <= until else 0.0)
         return cells, until
 
     def resized(self, factor: float) -> Task:
@@ -256,8 +260,10 @@ class Task(TaskOptions):
         """Everything that the losses depend on, as plain data. A study can be resumed only by a
         task with the same description."""
         recipe = self.tried.recipe
+        of_data = {"losses": OF_DATA} if _has_spreads(self.target) else {}
         return {
             "order of a step": ORDER,
+            **of_data,
             "scene": recipe[0] if recipe else getattr(self.family.function, "__name__", "scene"),
             "fixed": {n: _without_addresses(v) for n, v in self.family.fixed.items()},
             "effects": self.tried.listing,
@@ -337,6 +343,11 @@ def _is_step(time: float, dt: float) -> bool:
     """Whether a time, h, is one step of dt hours or a whole number of them."""
     steps = time / dt
     return round(steps) >= 1 and abs(steps - round(steps)) <= 1e-6 * steps
+
+
+def _has_spreads(target: Target) -> bool:
+    """Whether a target, or one in it, compares by spreads."""
+    return isinstance(target, Observed | Measured) or any(map(_has_spreads, inner_targets(target)))
 
 
 def _fitting_words(times: Sequence[float], dt: float) -> str:

@@ -127,6 +127,7 @@ def test_a_column_that_is_no_tensor_and_a_field_of_another_shape():
         (lambda s: {"length": s.length.numpy()}, r"state\.length = .*must be a tensor"),
         (lambda s: {"position": s.position.tolist()}, r"state\.position = .*must be a tensor"),
         (lambda s: {"uid": s.uid[:1]}, r"state\.uid = '\(1,\)"),
+        (lambda s: {"parent": s.parent[:1]}, r"state\.parent = '\(1,\)"),
     ],
 )
 def test_a_step_takes_no_state_with_columns_of_another_shape(change, message):
@@ -157,3 +158,11 @@ def test_cell_types_that_founders_bring_may_be_needed():
         assert model.step(model.start(), 0.1).cell_type.dtype == torch.int64
     with pytest.raises(tf.InputError, match="typed needs the field 'cell_type'"):
         tf.Scene(Typed(), tf.Growth(rate=1.0), dim=2)
+
+
+def test_fewer_rows_of_what_is_not_changed():
+    """A step that says it changes cells, and leaves out but one of their columns."""
+    with pytest.raises(tf.InputError, match=r"gave 'uid' of shape \(2,\): it must be \(1,\)"):
+        run(lambda s: s.replace(colony=s.colony[:1]), ("cells",))
+    with pytest.raises(tf.InputError, match=r"gave 'next_uid' of shape \(1,\).*for each colony"):
+        run(lambda s: s.replace(next_uid=s.next_uid[:1]), ("cells",))

@@ -57,12 +57,12 @@ def check_step(
                 " state.with_fields(…)."
             )
         new = getattr(after, what) if what in COLUMNS else after.fields[what]
-        if new is old:
-            continue
         if not isinstance(new, Tensor):
             raise checks.InputError(f"{name}.step gave {what!r} as {_shown(new)}, not a tensor.")
         if what in COLUMNS:
             _check_shape(name, what, new, old, after)
+        if new is old:
+            continue
         if new.dtype != old.dtype:
             raise checks.InputError(
                 f"{name}.step gave {what!r} as {_type(new)}; it is {_type(old)}: write"

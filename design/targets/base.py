@@ -22,7 +22,7 @@ OUTSIDE = "out."
 # The loss of a failed colony: where losses have no upper limit, and where they end at 1.
 WORST, FAILED = 1e9, 1.5
 FAR = 100.0  # spreads, from which on losses grow linearly; those beyond MOST count as so far
-MOST = 1e6
+MOST = 1e5
 # A target may read these, and what serves the numerics, but they are none to offer.
 OF_DIVISION = ("division_threshold", "birth_length")
 
@@ -54,6 +54,12 @@ class Target(metaclass=checks.KnownKeywords):
     def times(self) -> tuple[float, ...]:
         """Times, h, at which it must see a colony after a step, beside the end."""
         return ()
+
+    @property
+    def first_time(self) -> float:
+        """The time, h, before which it has seen nothing of a colony; 0 where it looks at the end
+        only."""
+        return min(self.times, default=0.0)
 
     @property
     def arguments(self) -> tuple[Mapping[str, float], ...]:
@@ -298,7 +304,7 @@ def species_name(name: str, given: object) -> None:
 def huber(apart: Tensor) -> Tensor:
     """Residuals of these differences in spreads: they are the same up to FAR, and beyond it their
     squares grow linearly (Huber, Ann. Math. Stat. 35, 73, 1964), so that a search knows the way
-    back. A square is at most a fifth of a failed loss."""
+    back. A square is at most a fiftieth of a failed loss."""
     size = apart.abs().clamp(max=MOST)
     beyond = FAR * (2.0 * size.clamp(min=FAR) / FAR - 1.0).sqrt()
     return torch.where(size > FAR, apart.sign() * beyond, apart)

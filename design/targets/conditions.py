@@ -81,6 +81,10 @@ class Conditions(SumOfTargets):
     def failed(self) -> float:  # type: ignore[override]
         return max(part.failed for part in self.parts)
 
+    @property
+    def first_time(self) -> float:
+        return max(part.first_time for part in self.parts)
+
     def label(self, place: int) -> str:
         """A condition in words."""
         return ", ".join(f"{name} = {value:g}" for name, value in self.arguments[place].items())
@@ -105,9 +109,8 @@ class Conditions(SumOfTargets):
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         mine = self.condition_of(state)
         found = self.losses(state, history).gather(1, mine.unsqueeze(1)).squeeze(1)
-        return torch.where(
-            found < self.failed, found * found.new_tensor(self._weights)[mine], found
-        )
+        weighted = (found * found.new_tensor(self._weights)[mine]).clamp(max=self.failed)
+        return torch.where(found < self.failed, weighted, found)
 
     def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor | None:
         each = self.of_courses(state, history)

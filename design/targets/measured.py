@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -229,16 +230,18 @@ def _depends_on_levels(measure: Measure, state: tf.State) -> bool:
     sizes alone, such as the volume of a colony, has a derivative of 0 by what circuits do."""
     draws = torch.Generator().manual_seed(0)
     fields = {n: x for n, x in state.fields.items() if x.is_floating_point()}
+    random = lambda x: 10.0 ** (12.0 * torch.rand(x.shape, generator=draws) - 6.0)
+    ways = [partial(torch.full_like, fill_value=level) for level in (1e-6, 1e6)] + [random] * TRIED
     found = []
     try:
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            for _ in range(TRIED):
-                drawn = {n: 10.0 ** (12.0 * torch.rand(x.shape, generator=draws) - 6.0) for n, x in
-                         fields.items()}  # fmt: skip
-                moved = state.with_fields(**{n: x.to(fields[n]) for n, x in drawn.items()})
-                found.append(measure(moved))
-            return not all(torch.equal(found[0], other) for other in found[1:])
+            for way in ways:
+                moved = {n: way(x).to(x) for n, x in fields.items()}
+                found.append(measure(state.with_fields(**moved)))
+            first, *others = found
+            same = [(x == first) | (x.isnan() & first.isnan()) for x in others]
+            return not all(bool(x.all()) for x in same)
     except Exception:  # of a function that takes no such levels
         return True
 

@@ -319,7 +319,8 @@ class Observed(Target):
         """By how many spreads statistics (B, K) are off."""
         low, high = (found.new_tensor(x) for x in zip(*self.wanted, strict=True))
         near = torch.minimum(torch.maximum(found.detach(), low), high)
-        return (found - near) / found.new_tensor(self.spread)
+        inside = (low < high) & (low <= found) & (found <= high)  # without a slope
+        return torch.where(inside, 0.0, (found - near) / found.new_tensor(self.spread))
 
     def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         apart = self.apart(self.statistics(state, history))
@@ -354,7 +355,8 @@ class Observed(Target):
     @property
     def evidence(self) -> dict[str, tuple[float, float]]:
         found = dict(zip(self.plan.names, zip(self.values, self.spread, strict=True), strict=True))
-        found = {n: seen for n, seen in found.items() if n not in self.bounds}
+        ranges = self.bounds
+        found = {n: seen for n, seen in found.items() if n not in ranges}
         if LOG_CELLS not in found:
             return found
         log, spread = found.pop(LOG_CELLS)

@@ -95,14 +95,24 @@ def checked_data(observed: Any) -> Observed:
             " ObservedCourse([…])."
         )
     data = ObservedConditions(observed) if isinstance(observed, Conditions) else as_data(observed)
-    if not isinstance(data, Observed):
+    data_of(observed)
+    return cast(Observed, data)
+
+
+def data_of(target: Target) -> list[Observed]:
+    """The data of each condition, or of the only one. Raises InputError for what is none, and for a
+    range in place of a number."""
+    parts = [as_data(x) for x in (target.parts if isinstance(target, Conditions) else [target])]
+    found = [part for part in parts if isinstance(part, Observed)]
+    if len(found) < len(parts):
         rule = "an Observed, such as Observed.from_table(…), a Measured, or Conditions of these"
-        raise checks.input_error("observed", observed, rule)
-    for name, (low, high) in zip(data.plan.names, data.wanted, strict=True):
-        if low != high:
-            rule = "one number, as data have one"
-            raise checks.input_error(f"Measured.wanted[{name!r}]", (low, high), rule)
-    return data
+        raise checks.input_error("observed", target, rule)
+    for part in found:
+        for name, (low, high) in zip(part.plan.names, part.wanted, strict=True):
+            if low != high:
+                rule = "one number, as data have one"
+                raise checks.input_error(f"Measured.wanted[{name!r}]", (low, high), rule)
+    return found
 
 
 def errors(observed: Observed) -> list[float]:

@@ -219,7 +219,7 @@ class ObservedCourse(Observed):
         for group in groups:
             checks.choice("ObservedCourse.without", group, tuple(sorted(known)))
         each = (f.without(*(g for g in groups if g in f.plan.groups)) for f in self.frames)
-        return ObservedCourse(tuple(each))
+        return _course(tuple(each), self.time)
 
     def check(self, state: tf.State) -> None:
         for frame in self.frames:
@@ -325,8 +325,13 @@ def ending_at(data: Observed, end: float) -> Observed:
     """The same data of colonies that go on until `end` h."""
     if data.time in (None, end):
         return data
+    return _course(data.frames if isinstance(data, ObservedCourse) else (data,), end)
+
+
+def _course(frames: tuple[Observed, ...], end: float | None) -> ObservedCourse:
+    """The course of checked frames, one at least, in colonies that end at `end` h."""
     made = object.__new__(ObservedCourse)
-    made._set(data.frames if isinstance(data, ObservedCourse) else (data,), end)
+    made._set(frames, end)
     return made
 
 

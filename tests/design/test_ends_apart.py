@@ -1,6 +1,7 @@
 """Data of several conditions that end at different times, readings that are missing, and ranges."""
 
 import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,19 @@ import torch
 from scipy.optimize import least_squares
 
 import torchfilm as tf
-from design import Conditions, Measured, Observed, ObservedCourse, Parameter, Search, Task, infer
+from design import (
+    Conditions,
+    Measured,
+    Observed,
+    ObservedCourse,
+    OnFraction,
+    Parameter,
+    Search,
+    Task,
+    infer,
+)
+from design.scene_family import _free_growth
+from design.targets.observed_course import ending_at
 
 ONE = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]])
 SPACE = [Parameter("start", 0.1, 100.0, log=True), Parameter("loss", 0.01, 5.0, log=True)]
@@ -185,3 +198,116 @@ def test_a_check_grows_data_to_no_other_size():
     assert found.sizes == () and len(found.losses) == 1
     with pytest.raises(tf.InputError, match=r"sizes = \(0\.5,\).*data were observed at 2 h"):
         best.check(seeds=1, sizes=(0.5,), progress=False)
+
+
+def test_within_a_range_there_is_no_slope():
+    """It was 1, so that readings within their ranges pulled at descents: after 150 colonies the
+    loss was 3, not 1e-11. An infinite measure is within an open range."""
+    frames = [
+        Measured({"gfp": gfp}, {"gfp": (0.1, 50.0)}, {"gfp": 0.01}, smooth=True, time=time)
+        for time in (0.2, 0.4, 0.6)
+    ]
+    exact = [
+        Measured({"gfp": gfp}, {"gfp": level(t)}, {"gfp": 0.01}, smooth=True, time=t)
+        for t in (1.0, 2.0)
+    ]
+    target = ObservedCourse([*frames, *exact])
+    found = torch.tensor([[1.0, 0.05, 60.0, level(1.0), level(2.0)]], dtype=torch.float64)
+    apart = target.apart(found.requires_grad_())
+    (slope,) = torch.autograd.grad(apart.sum(), found)
+    assert slope[0].tolist() == pytest.approx([0.0, 100.0, 100.0, 100.0, 100.0])
+    search = Search(washout, SPACE, target, replicates=1, dtype=torch.float64)
+    assert search.run(colonies=60, progress=False).loss < 1e-4
+    endless = ObservedCourse([
+        Measured({"gfp": gfp}, {"gfp": (2.0, math.inf)}, {"gfp": 0.1}, time=t, smooth=True)
+        for t in (1.0, 2.0)
+    ])  # fmt: skip
+    assert endless.apart(torch.tensor([[math.inf, 1.0]])).tolist() == [[0.0, -10.0]]
+    assert endless.misses({"gfp at 1 h": 1.5, "gfp at 2 h": 9.0}) == pytest.approx(
+        {"gfp at 1 h": 5.0, "gfp at 2 h": 0.0}
+    )
+    assert endless.evidence == {} and set(endless.bounds) == {"gfp at 1 h", "gfp at 2 h"}
+
+
+def test_weights_leave_failed_losses_and_other_targets_alone():
+    long, short = course(np.arange(1, 31) / 10, np.ones(30)), course((1.0, 3.0), (1.0, 1.0))
+    data = Conditions([({"dose": 1.0}, long), *(({"dose": d}, short) for d in range(2, 12))])
+    assert data._weights[0] == pytest.approx(30 * 11 / 50)
+    assert sum(data._weights) == pytest.approx(11)
+    model = washout(1e12, 0.5, torch.arange(1.0, 12.0)).bind(11, dtype=torch.float64)
+    state, notes = model.start(), []
+    for _ in range(30):
+        state = model.step(state)
+        notes.append(data.note(state))
+    far = data.loss(state, torch.stack(notes))
+    assert bool((far < data.failed).all()) and float(far[0]) > 1e8
+    gone = state.remove(torch.ones(11, dtype=torch.bool), "removed")
+    failed = data.loss(gone, torch.stack(notes))
+    assert failed.tolist() == [data.failed] * 11
+    lit = OnFraction("gfp", 0.5, level=1.0)
+    some = Conditions([({"dose": 1.0}, long), ({"dose": 2.0}, lit)])
+    assert some._weights == (1.0, 1.0)
+
+
+def test_a_first_look_waits_for_the_first_reading_of_every_condition():
+    """One that ended before had a loss of 0."""
+    early, late = course((0.5, 3.0), (1.0, 1.0)), course((2.0, 3.0), (1.0, 1.0))
+    both = Conditions([({"dose": 1.0}, early), ({"dose": 2.0}, late)])
+    task = Task(washout, SPACE, both, replicates=1)
+    assert both.first_time == 2.0 and task.end(0.25)[1] == 2.0 and task.end(1.0)[1] == 3.0
+
+
+def test_ends_are_kept_and_said():
+    seen = [Observed.from_state(tf.rollout(washout().bind(1), until=t)) for t in (1.0, 2.0)]
+    frames = [replace(x, time=t) for x, t in zip(seen, (1.0, 2.0), strict=True)]
+    aged = ObservedCourse(frames)
+    later = ending_at(aged, 4.0)
+    assert later.time == 4.0 and later.times == (1.0, 2.0)
+    assert later.without("length").time == 4.0 and later.without("length").times == (1.0, 2.0)
+    state = washout().bind(1).start()
+    at = lambda time: state.replace(step=1, time=time)
+    assert later.unfit(at(4.0)) == [""] and "observed at 4 h" in later.unfit(at(2.0))[0]
+
+
+def test_a_study_of_other_losses_does_not_go_on(tmp_path, monkeypatch):
+    """It would hold losses that do not compare."""
+    path, data = tmp_path / "study.h5", course((1.0, 2.0), (level(1.0), level(2.0)))
+    Search(washout, SPACE, data, replicates=1).run(colonies=12, progress=False, study=path)
+    monkeypatch.setattr("design.task.OF_DATA", "of a later version")
+    with pytest.raises(tf.InputError, match="losses"):
+        Search(washout, SPACE, data, replicates=1).run(colonies=24, progress=False, study=path)
+
+
+class Grows(tf.Effect):
+    title, stage = "grows", 15
+
+    def step(self, state, dt, values):
+        return state
+
+
+SLOW = tf.Circuit(lambda u, s, p, cell: {"slow": -u.slow}, species="slow", initial={"slow": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("effects", "free"),
+    [
+        ((tf.Growth(rate=0.8),), 0.8),
+        (
+            (
+                tf.Growth(rate=0.8, factor="slow"),
+                tf.Rules(lambda cells: None, variables={"slow": 1.0}),
+            ),
+            0.0,
+        ),
+        ((tf.Growth(rate=0.8, law="linear"),), 0.0),
+        ((tf.Growth(rate=0.8), tf.Mechanics([tf.Plane(x=9.0, facing="-x")], dim=2)), 0.0),
+        ((tf.Growth(rate=0.8), tf.Mechanics(dim=2)), 0.8),
+        ((tf.Growth(rate=0.8), tf.Lysis(rate=0.1)), 0.0),
+        ((tf.Growth(rate=0.8), dataclass(frozen=True)(Grows)()), 0.0),
+    ],
+)
+def test_what_may_hold_a_colony_down(effects, free):
+    scene = tf.Scene(*effects, tf.Division(length=4.0), dim=2)
+    assert _free_growth(scene, scene.bind().start()) == pytest.approx(free)
+    never = tf.Scene(*effects, dim=2)
+    assert _free_growth(never, never.bind().start()) == 0.0

@@ -17,6 +17,7 @@ from design import (
     Prediction,
     Search,
 )
+from design.fit_plot import _places, spread_over
 from design.targets.observed_conditions import checked_data
 from design.targets.readings import readings_of
 
@@ -118,3 +119,48 @@ def test_a_prediction_is_a_band():
     assert "of a right model" not in shown.table()
     far = Prediction(data, np.zeros((3, 1)), np.stack([values - 1, values, values + 1]))
     assert "give infer more simulations" in far.table()
+
+
+def test_lone_readings_and_several_inducers_are_seen():
+    """A line of one point was none, and all doses stood at one place."""
+    at = lambda dose: Measured(
+        {"gfp": gfp}, {"gfp": 0.1 * dose}, {"gfp": 0.1}, time=1.0, smooth=True
+    )
+    few = Conditions([({"dose": 1.0}, course()), ({"dose": 5.0}, at(5.0))])
+    assert readings_of(few)[-1].full == "gfp (dose = 5)"
+    _, figure = picture(few)
+    marks = [x.get_marker() for x in figure.axes[0].lines if len(x.get_xdata()) == 1]
+    assert marks.count("_") == 2
+    two = Conditions([({"dose": d, "make": m}, at(d)) for d in (1.0, 2.0) for m in (0.5, 1.0)])
+    readings = readings_of(two)
+    place, words, doses = _places(readings)
+    assert words == "condition" and not doses and [place(r) for r in readings] == [0, 1, 2, 3]
+
+
+def test_a_condition_without_the_first_measure_is_in_the_legend():
+    one = ObservedCourse.of_measures(
+        {"gfp": gfp}, times=(1.0, 0.5)[::-1], values={"gfp": (0.1, 0.2)}, spread={"gfp": 0.1}
+    )
+    other = ObservedCourse.of_measures(
+        {"double": double}, times=(0.5, 1.0), values={"double": (0.1, 0.2)}, spread={"double": 0.1}
+    )
+    _, figure = picture(Conditions([({"dose": 1.0}, one), ({"dose": 5.0}, other)]))
+    words = [t.get_text() for t in figure.axes[0].get_legend().get_texts()]
+    assert {"dose = 1", "dose = 5"} <= set(words)
+
+
+def test_what_is_no_number_is_left_out():
+    found = spread_over({"a": [1.0, math.nan, 3.0], "b": [math.nan]})
+    assert found == {"a": (2.0, 1.0, 3.0)}
+
+
+def test_a_number_alone_and_the_ranges_of_a_gate_are_drawn_as_colonies():
+    alone = Measured({"gfp": gfp}, {"gfp": 0.5}, {"gfp": 0.1}, time=1.0, smooth=True)
+    gate = Conditions([
+        ({"dose": d}, Measured({"gfp": gfp}, {"gfp": wanted}, {"gfp": 0.1}, time=1.0))
+        for d, wanted in ((0.0, (0.0, 0.1)), (5.0, (0.5, 1.0)))
+    ])  # fmt: skip
+    for target in (alone, gate):
+        _, figure = picture(target)
+        titles = [ax.get_title() for ax in figure.axes]
+        assert any(t.startswith("first guess") for t in titles)

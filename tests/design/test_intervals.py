@@ -8,7 +8,7 @@ import torch
 from scipy.optimize import curve_fit
 
 import torchfilm as tf
-from design import Conditions, Measured, ObservedCourse, OnFraction, Parameter, Search
+from design import Conditions, Intervals, Measured, ObservedCourse, OnFraction, Parameter, Search
 
 ONE = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]])
 TIMES = np.arange(1, 9) * 0.5
@@ -122,3 +122,27 @@ def test_what_has_no_intervals(target, words):
     search = Search(washout, space, target, replicates=1, dtype=torch.float64, **options)
     with pytest.raises(tf.InputError, match=words):
         search.run(colonies=12, progress=False).intervals()
+
+
+def made(covariance, loss=1.0, readings=20, values=(1.0, 1.0)) -> Intervals:
+    space = (Parameter("a", 0.5, 2.0), Parameter("b", 0.5, 2.0))
+    return Intervals(space, values, np.array(covariance), readings, loss)
+
+
+def test_what_a_table_says():
+    """Of 20 readings and two parameters the loss is 0.9 ± 0.3."""
+    related = made([[0.01, -0.0095], [-0.0095, 0.01]])
+    assert "a and b are not told apart: their correlation is -0.95" in related.table()
+    for loss, far in ((0.95, False), (1.75, False), (1.85, True)):
+        said = made(np.diag([0.01, 0.01]), loss).table()
+        assert ("too narrow" in said) == far and "not told apart" not in said
+    # 1 ± 0.6: below the lower bound, not above the upper one
+    assert "beyond both" not in made(np.diag([0.13, 0.01])).table()
+    assert "beyond both" in made(np.diag([0.5, 0.01])).table()
+
+
+def test_data_of_which_some_have_no_time():
+    """A search takes them, and so do intervals."""
+    at = lambda time: Measured({"gfp": gfp}, {"gfp": 1.5}, {"gfp": 0.1}, time=time, smooth=True)
+    some = Conditions([({"dose": 1.0}, at(None)), ({"dose": 2.0}, at(2.0))])
+    assert fitted(some, "start").intervals().readings == 2

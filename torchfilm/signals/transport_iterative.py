@@ -141,7 +141,7 @@ class Unsplit:
         right = wide if self.theta == 1 else wide + (1 - self.theta) * self.dt * linear(wide)
         if self.operator.gain is not None:
             right = right + self.dt * self.operator.gain
-        if in_forward_mode():
+        if in_forward_mode() and torch.is_grad_enabled():
             refuse_both("a solve of transport", right, left(wide))
         with torch.no_grad():
             bare = lambda x: both(x)[0]
