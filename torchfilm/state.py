@@ -328,7 +328,11 @@ class State:
         if not bool(gone.any()):
             return self
         lost, kept = torch.nonzero(gone).squeeze(1), torch.nonzero(~gone).squeeze(1)
-        return self.take(kept).replace(ended=(*self.ended, note_of(self, lost, fate)))
+        return self.take(kept).replace(ended=(*self.ended, self.noted_end(lost, fate)))
+
+    def noted_end(self, rows: Tensor, fate: str) -> Ended:
+        """What the lineage keeps of the cells `rows` (M,), which leave."""
+        return note_of(self, rows, fate)
 
     def select(self, colonies: row_checks.Rows) -> State:
         """Some colonies of the batch, by their places, in the order given. Each goes on as it would

@@ -95,16 +95,22 @@ class RecordingState(State):
 
     def reset_at_division(self, daughters: torch.Tensor, names: Any) -> State:
         # the fields' own rules read here, not the effect that divides
-        self.log.quiet = True
-        found = super().reset_at_division(daughters, names)
-        self.log.quiet = False
-        return found
+        return self._quietly(super().reset_at_division, daughters, names)
 
     def remove(self, gone: torch.Tensor, fate: str) -> State:
+        return self._quietly(super().remove, gone, fate)
+
+    def noted_end(self, rows: torch.Tensor, fate: str) -> Any:
         # what the lineage keeps of the cells is not what the effect goes by
-        self.log.quiet = True
-        found = super().remove(gone, fate)
-        self.log.quiet = False
+        return self._quietly(super().noted_end, rows, fate)
+
+    def check_fields(self) -> None:
+        self._quietly(super().check_fields)
+
+    def _quietly(self, call: Any, *given: Any) -> Any:
+        before, self.log.quiet = self.log.quiet, True
+        found = call(*given)
+        self.log.quiet = before
         return found
 
 

@@ -24,7 +24,6 @@ from torchfilm.effects.division_lengths import CAPS, least_length, smaller_share
 from torchfilm.physics import capsule
 from torchfilm.resolver import Resolved, Values
 from torchfilm.state import CELL, Births, Field, State
-from torchfilm.state_colonies import note_of
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets, repeated
 from torchfilm.tools.reads import numbers, rows_where
@@ -342,7 +341,7 @@ def divide(
     first, second = daughters.chunk(2)
     uid, length = (x.index_select(0, daughters) for x in (new.uid, new.length))
     births = Births(first, second, uid, length, state, rows)
-    note = note_of(state, rows, "divided")
+    note = state.noted_end(rows, "divided")
     at = new.position if new.space is None else new.space.inside(new.position)
     new = new.replace(births=(*new.births, births), ended=(*new.ended, note), position=at)
     if by_kernels and fresh is not None:
