@@ -17,7 +17,7 @@ from design.targets.observed_conditions import data_of
 from torchfilm import checks
 
 UNTOLD = 1e-12  # of the greatest information along a direction; with less nothing is told of it
-ALIKE = 0.9  # a correlation from which on two parameters are not told apart
+TOGETHER = 0.9  # a correlation from which tables say that two parameters are not told apart
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -73,12 +73,8 @@ class Intervals:
         width = [max(len(row[k]) for row in rows) for k in range(2)]
         lines = [f"{a:<{width[0]}}  {b:>{width[1]}}  {c}" for a, b, c in rows]
         related = self.correlation
-        lines += [
-            f"{self.parameters[i].name} and {self.parameters[j].name} are not told apart: their"
-            f" correlation is {related[i, j]:.2f}"
-            for i, j in combinations(range(len(self.parameters)), 2)
-            if abs(related[i, j]) > ALIKE
-        ]
+        pairs = combinations(enumerate(p.name for p in self.parameters), 2)
+        lines += not_told_apart({(one, other): related[i, j] for (i, one), (j, other) in pairs})
         expected = max(self.readings - len(self.parameters), 0) / self.readings
         freedom = max(self.readings - len(self.parameters), 1)
         far = self.loss > expected + 3 * math.sqrt(2 * freedom) / self.readings
@@ -94,6 +90,15 @@ class Intervals:
 
     def _repr_html_(self) -> str:
         return tf.displays.card("Intervals", tf.displays.text(self.table()))
+
+
+def not_told_apart(correlations: Mapping[tuple[str, str], float]) -> list[str]:
+    """What to know of two parameters that the data tell together."""
+    return [
+        f"{one} and {other} are not told apart: their correlation is {r:.2f}"
+        for (one, other), r in correlations.items()
+        if abs(r) >= TOGETHER
+    ]
 
 
 def intervals_of(

@@ -9,6 +9,7 @@ import numpy as np
 
 import torchfilm as tf
 from design.calibration import Calibration
+from design.intervals import not_told_apart
 from design.neural_posterior import NeuralPosterior
 from design.parameters import Parameter, Value, show_value
 from design.posterior_plot import draw_corner
@@ -29,7 +30,6 @@ STREAM = 2  # of the truths of a calibration
 PREDICTED = 3  # of predictions
 DRAWN, PRIOR_DRAWN = 4, 20_000  # of points of the prior in a picture, and how many
 ALIKE = 1.5  # numbers of cells that differ by less than this factor make about the same intervals
-TOGETHER = 0.9  # a correlation from which the table tells of it
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -182,11 +182,7 @@ class Posterior:
         if len(failures) > 3:
             lines.append(f"{sum(n for _, n in failures[3:])} simulations failed for other reasons")
         lines += extinct_words(self.observed, [why for why, _ in failures])
-        lines += [
-            f"{one} and {other} are not told apart: their correlation is {r:.2f}"
-            for (one, other), r in self.correlations.items()
-            if abs(r) >= TOGETHER
-        ]
+        lines += not_told_apart(self.correlations)
         if self.other_sizes:
             lines.append(self.other_sizes)
         if self.surprises:

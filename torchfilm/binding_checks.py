@@ -14,7 +14,7 @@ from torchfilm.effect import BUILT_IN, BoundEffect, Effect, is_own, makes_longer
 from torchfilm.parameters import parameters
 from torchfilm.resolver import FirstValue
 from torchfilm.rule_views import KNOWN_FIELDS, MEANS
-from torchfilm.state import CELL, OUTSIDE, State
+from torchfilm.state import CELL, OUTSIDE, PER_CELL, State
 from torchfilm.tools import checks, row_checks
 from torchfilm.tools.hashing import trained
 from torchfilm.tools.tangents import tracked
@@ -22,9 +22,6 @@ from torchfilm.tools.warn_once import warn
 
 if TYPE_CHECKING:
     from torchfilm.model import Model
-
-# The columns of cells, as `row_checks.is_whole` takes them.
-GEOMETRY = ("position", "axis", "length", "radius", "colony", "uid", "parent")
 
 
 def check_names(effects: Sequence[BoundEffect], declared: Iterable[str], state: State) -> None:
@@ -233,8 +230,8 @@ def check_fits(state: object, model: Model, fields: Mapping[str, object]) -> Non
     if not isinstance(state, State):
         hint = "Such as model.start(), or the last one of tf.simulate(…)."
         raise checks.input_error("step(state)", state, "a tf.State", hint)
-    if not row_checks.is_whole([getattr(state, n) for n in GEOMETRY]):
-        columns = {n: getattr(state, n) for n in GEOMETRY}
+    columns = {n: getattr(state, n) for n in PER_CELL}
+    if not row_checks.is_whole(columns):
         row_checks.check_geometry(columns, state.colonies, model.dim, model.batch.dtype)
     alike = state.dim == model.dim and state.dtype == model.batch.dtype
     if not (alike and fields.keys() <= state.fields.keys()):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -299,6 +299,14 @@ def species_name(name: str, given: object) -> None:
         raise checks.input_error(
             name, given, 'the name of a species, such as "yfp", or of a signal, such as "out.ahl"'
         )
+
+
+def beyond(found: Tensor, wanted: Sequence[tuple[float, float]]) -> Tensor:
+    """By how much numbers (B, K) are off these ranges; 0 within one, without a slope."""
+    low, high = (found.new_tensor(x) for x in zip(*wanted, strict=True))
+    near = torch.minimum(torch.maximum(found.detach(), low), high)
+    inside = (low < high) & (low <= found) & (found <= high)
+    return torch.where(inside, 0.0, found - near)
 
 
 def huber(apart: Tensor) -> Tensor:

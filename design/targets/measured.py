@@ -15,6 +15,7 @@ import torchfilm as tf
 from design.targets.base import (
     WORST,
     Target,
+    beyond,
     ended_elsewhere,
     huber,
     inner_targets,
@@ -159,13 +160,11 @@ class Measured(Target):
         return out
 
     def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor:
-        parts = []
-        for name, found in zip(self.functions, self._found(state), strict=True):
-            low, high = self.wanted[name]  # type: ignore[misc]
-            beyond = torch.where(found > high, found - high, torch.where(found.isnan(), found, 0.0))
-            apart = torch.where(found < low, found - low, beyond)
-            parts.append(huber(apart / self.spread[name]))
-        return torch.stack(parts, 1) / math.sqrt(len(parts))
+        found = self.found(state)
+        ends = [self.wanted[name] for name in self.functions]
+        spread = found.new_tensor([self.spread[name] for name in self.functions])
+        apart = beyond(found, ends) / spread  # type: ignore[arg-type]
+        return huber(apart) / math.sqrt(len(ends))
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         apart = self.residuals(state)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import Target, ended_elsewhere, huber, require
+from design.targets.base import Target, beyond, ended_elsewhere, huber, require
 from design.targets.measured import in_words
 from design.targets.observed_like import counted, named, shared_plan, with_caps
 from design.targets.observed_masks import masks_table
@@ -317,10 +317,7 @@ class Observed(Target):
 
     def apart(self, found: Tensor) -> Tensor:
         """By how many spreads statistics (B, K) are off."""
-        low, high = (found.new_tensor(x) for x in zip(*self.wanted, strict=True))
-        near = torch.minimum(torch.maximum(found.detach(), low), high)
-        inside = (low < high) & (low <= found) & (found <= high)  # without a slope
-        return torch.where(inside, 0.0, (found - near) / found.new_tensor(self.spread))
+        return beyond(found, self.wanted) / found.new_tensor(self.spread)
 
     def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         apart = self.apart(self.statistics(state, history))

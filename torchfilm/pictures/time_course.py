@@ -25,8 +25,7 @@ WIDE, HIGH = 5.0, 2.2  # inches, of a panel
 FEW = 4  # colonies up to which a band shows the spread between cells
 BAND = (10.0, 90.0)  # percentiles
 TENFOLD = 10.0  # numbers of cells of such a range are drawn by their logarithms
-
-
+ALL = -1  # the kind of cells that are not told apart
 STYLES = ("-", "--", ":", "-.")  # of colonies, where colours are those of kinds
 
 
@@ -56,8 +55,10 @@ def time_course(
         frames = RecordedFrames(results, range(len(results)))
         most = most if by is None else min(most, len(STYLES))
         places, more = choose_colonies(frames.shown(False), results.colony_id, colonies, most)
-        lines = _lines(results, places, by, frames)
-        seen = np.stack([_seen(results, k, lines, by, quantities) for k in range(len(results))])
+        found = [_seen(results, k, places, by, quantities) for k in range(len(results))]
+        lines = _lines(places, sorted({kind for one in found for _, kind in one}), by, frames)
+        none = np.full((1 + len(quantities), 3), np.nan)
+        seen = np.stack([[one.get((x.place, x.kind), none) for x in lines] for one in found])
         figure = new_figure(WIDE, HIGH * (1 + len(quantities)) + 0.3, dpi)
         axes = figure.subplots(1 + len(quantities), 1, sharex=True, squeeze=False)[:, 0]
         for k, line in enumerate(lines):
@@ -71,7 +72,7 @@ def time_course(
                 if len(lines) <= FEW:
                     axes[1 + row].fill_between(results.times, low, high, color=line.colour,
                                                alpha=0.2, lw=0)  # fmt: skip
-        counts = seen[:, :, 0, 0]
+        counts = np.nan_to_num(seen[:, :, 0, 0])
         some = counts[counts > 0].min(initial=np.inf)
         _finish(axes[0], "cells", log=bool(counts.max(initial=0.0) > TENFOLD * max(1, some)))
         for row, name in enumerate(quantities):
@@ -89,28 +90,24 @@ class CourseLine:
     """The cells of a colony at a place of the batch, or those of one kind, and how to draw them."""
 
     place: int
-    kind: int | None
+    kind: int
     label: str
     colour: Any
     style: str
 
 
 def _lines(
-    results: Results, places: Sequence[int], by: str | None, frames: RecordedFrames
+    places: Sequence[int], kinds: Sequence[int], by: str | None, frames: RecordedFrames
 ) -> list[CourseLine]:
     """One for each colony, or for each kind of each."""
     name = frames[0].name
     if by is None:
         colours = _colours(len(places))
-        return [CourseLine(p, None, name(p), c, "-") for p, c in zip(places, colours, strict=True)]
+        return [CourseLine(p, ALL, name(p), c, "-") for p, c in zip(places, colours, strict=True)]
     if len(places) > len(STYLES):
         rule = f"up to {len(STYLES)} colonies where cells are told apart by {by!r}"
         raise checks.input_error("colonies", [name(p) for p in places], rule)
-    columns = [known_quantities(results, k, by)[1][by] for k in range(len(results))]
-    if any(x.dtype.kind not in "iub" for x in columns):
-        raise checks.input_error("by", by, "a field of whole numbers, such as 'cell_type'")
-    kinds = np.unique(np.concatenate(columns)).tolist()
-    several = len(results.colony_id) > 1
+    several = len(frames[0].counts) > 1
     return [
         CourseLine(p, kind, f"{name(p)}, {by} {kind}" if several else f"{by} {kind}", c, style)
         for p, style in zip(places, STYLES, strict=False)
@@ -119,22 +116,26 @@ def _lines(
 
 
 def _seen(
-    results: Results, frame: int, lines: Sequence[CourseLine], by: str | None, names: Sequence[str]
-) -> np.ndarray:
-    """Of the cells of each line their number, three times, and of each quantity the mean, and the
-    ends of the band, (lines, 1 + quantities, 3); NaN without cells."""
-    wanted = names if by is None else (*names, by)
-    cells, known = known_quantities(results, frame, *wanted)
-    found = np.full((len(lines), 1 + len(names), 3), np.nan)
-    for k, line in enumerate(lines):
-        mine = cells["colony"] == line.place
-        mine = mine if by is None else mine & (known[by] == line.kind)
-        found[k, 0] = mine.sum()
-        for row, name in enumerate(names):
-            values = known[name][mine].astype(float)
-            if len(values):
-                found[k, 1 + row] = values.mean(), *np.percentile(values, BAND)
-    return found
+    results: Results, frame: int, places: Sequence[int], by: str | None, names: Sequence[str]
+) -> dict[tuple[int, int], np.ndarray]:
+    """Of the cells of each place and kind their number, three times, and of each quantity the mean,
+    and the ends of the band, (1 + quantities, 3); NaN without cells."""
+    cells, known = known_quantities(results, frame, *(names if by is None else (*names, by)))
+    kind = np.full(len(cells["uid"]), ALL) if by is None else known[by]
+    if kind.dtype.kind not in "iub":
+        raise checks.input_error("by", by, "a field of whole numbers, such as 'cell_type'")
+    out = {}
+    for one in [ALL] if by is None else np.unique(kind).tolist():
+        for place in places:
+            mine = (cells["colony"] == place) & (kind == one)
+            found = np.full((1 + len(names), 3), np.nan)
+            found[0] = mine.sum()
+            for row, name in enumerate(names):
+                values = known[name][mine].astype(float)
+                if len(values):
+                    found[1 + row] = values.mean(), *np.percentile(values, BAND)
+            out[place, one] = found
+    return out
 
 
 def _colours(count: int) -> list[Any]:

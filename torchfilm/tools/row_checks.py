@@ -97,13 +97,14 @@ def check_declared(fields: Collection[str], declared: Collection[str]) -> None:
             raise checks.input_error("field", name, "declared", hint)
 
 
-def is_whole(columns: Sequence[Any]) -> bool:
-    """Whether the columns of cells, "position" and "axis" first, are tensors of one number of
-    rows."""
-    if not all(isinstance(x, Tensor) for x in columns):
+def is_whole(columns: Mapping[str, Any]) -> bool:
+    """Whether the columns of cells, by name, are tensors of one number of rows."""
+    if not all(isinstance(x, Tensor) for x in columns.values()):
         return False
-    position, axis, *others = (x.shape for x in columns)
-    return len(position) == 2 and position == axis and all(x == position[:1] for x in others)
+    place = columns["position"].shape
+    return len(place) == 2 and all(
+        x.shape == (place if n in ("position", "axis") else place[:1]) for n, x in columns.items()
+    )
 
 
 def check_geometry(columns: Mapping[str, Any], colonies: int, dim: int, dtype: Any) -> None:
