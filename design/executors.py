@@ -8,7 +8,6 @@ import pickle
 import sys
 import threading
 import traceback
-import warnings
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
@@ -58,11 +57,10 @@ def run_work_items(
         for _, future, _ in waiting:
             future.cancel()
     if lost:
-        warnings.warn(
+        checks.warn(
             f"the executor lost {len(lost)} of {len(items)} work items; this process ran them"
             f" ({type(lost[-1]).__name__}: {lost[-1]})",
-            RuntimeWarning,
-            stacklevel=3,
+            category=RuntimeWarning,
         )
 
 

@@ -29,6 +29,7 @@ CHECK = 1 / 3  # of the colonies of finals with several designs
 MOST_SHARE = 0.9  # of a budget
 LEAST = 4  # fresh seeds of a finalist
 ALIKE = 0.02  # designs that are nearer in every coordinate count as one
+SOUNDED = 2  # designs, and fresh seeds of each, that show whether seeds matter
 HOLDS = (8, 24)  # fresh seeds of a design that may hold the wanted loss: first, then in all
 TESTED = 3  # designs of a batch that may hold it
 BAND = 0.9  # probability of a band
@@ -83,8 +84,11 @@ class Finals(metaclass=checks.KnownKeywords):
         """Designs, each on one seed at all sizes, that the share of a budget allows."""
         return self.share * budget / sum(self.sizes)
 
-    def colonies(self, budget: float) -> float:
-        """Colonies of the finals of a search of `budget` colonies."""
+    def colonies(self, budget: float, certain: bool = False) -> float:
+        """Colonies of the finals of a search of `budget` colonies. certain: seeds make no
+        difference."""
+        if certain:
+            return LEAST * sum(self.sizes)
         total, before = self.check_seeds(budget), 0
         for count, seeds in self.rounds(budget):
             total, before = total + count * (seeds - before), seeds
@@ -119,7 +123,7 @@ def _fresh(
     losses = worst_of_sizes([_tested(study, point, size, first=first) for size in sizes])
     if len(losses) < LEAST:
         return None
-    rivals = {p.tobytes() for e in study.finals for p in e.points}
+    rivals = {p.tobytes() for p in _known(study) if len(_tested(study, p, sizes[0])) >= LEAST}
     chosen = first == FIRST_STREAM and len(rivals) > 1
     return FreshLosses(losses, float(task.reduced(losses[None])[0]), _band(task, losses), chosen)
 
@@ -131,7 +135,7 @@ def fresh_goals(
     the worst of its sizes, and the seeds of each. None before there are any."""
     last = [e for e in study.finals if e.size in sizes and e.each_goals is not None][-1:]
     seeds = max((e.streams[-1] + 1 - FIRST_STREAM for e in last), default=0)
-    points = {p.tobytes(): p for e in study.finals for p in e.points}.values()
+    points = _known(study)
     found = [
         (p, worst_of_sizes([_tested(study, p, size, "each_goals") for size in sizes]))
         for p in points
@@ -165,6 +169,20 @@ def _tested(
     return np.concatenate(found) if found else np.empty(0)
 
 
+def _known(study: Study) -> list[np.ndarray]:
+    """The designs that were grown on fresh seeds, (D,) each."""
+    return list({p.tobytes(): p for e in study.finals for p in e.points}.values())
+
+
+def is_certain(task: Task, study: Study) -> bool:
+    """Whether seeds make no difference to losses, as far as designs were grown on several: those
+    of one cell, say, whose circuit has no noise."""
+    each = [losses for e in study.finals for losses in e.losses]
+    sound = [losses for losses in each if not (losses == task.target.failed).any()]
+    alike = all(np.ptp(losses) <= 1e-9 * np.abs(losses).max() for losses in sound)
+    return alike and len({float(losses[0]) for losses in sound}) >= SOUNDED
+
+
 def _is_mean(task: Task) -> bool:
     """Whether the loss of a design is the mean of those of its colonies."""
     return task.reduce == "mean" and task.target.reduced(np.zeros((1, LEAST))) is None
@@ -185,8 +203,7 @@ def winner(task: Task, study: Study, sizes: Sequence[float]) -> np.ndarray | Non
     """The point (D,) of the design whose band ends lowest: few seeds make a wide band of a mean.
     But few seeds make a low quantile. So elsewhere a design must also be as good as those with
     fewer seeds on the seeds of these. None before a design was grown on fresh seeds."""
-    points = {p.tobytes(): p for e in study.finals for p in e.points}
-    found = ((_fresh(task, study, sizes, p, FIRST_STREAM), p) for p in points.values())
+    found = ((_fresh(task, study, sizes, p, FIRST_STREAM), p) for p in _known(study))
     known = [(fresh, p) for fresh, p in found if fresh is not None]
     # where every colony fails, a narrow band says nothing
     ends = lambda x: (bool((x[0].losses == task.target.failed).all()), x[0].band[1])
@@ -223,6 +240,9 @@ class FinalsRun:
         if self.task.goals:
             self._front()
             return
+        if is_certain(self.task, self.study):
+            self._grow(self._finalists()[:1], LEAST)
+            return
         chosen, wanted = self._finalists(), self.finals.check_seeds(self.budget)
         for count, seeds in self.finals.rounds(self.budget):
             chosen = self._grow(chosen[:count], seeds, kept=wanted * sum(self.finals.sizes))
@@ -233,6 +253,12 @@ class FinalsRun:
             while wanted > LEAST and not self._affords(self._cost(best, wanted, CHECK_STREAM)):
                 wanted -= 1
             self._grow([best], wanted, CHECK_STREAM)
+
+    def sound(self) -> None:
+        """Grow the first designs on a few fresh seeds: where these make no difference, the finals
+        need hardly any colonies."""
+        if not self.study.finals and len(self.finals.sizes) == 1:
+            self._grow(self._finalists()[:SOUNDED], SOUNDED)
 
     def holds(self, wanted: float) -> bool:
         """Whether one of the best designs, of all and of the last batch, holds a loss on fresh

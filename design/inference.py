@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 import torchfilm as tf
@@ -16,6 +18,7 @@ from design.parameters import Choice, Parameter
 from design.posterior import Posterior
 from design.prior import Prior
 from design.progress import advance, open_bar
+from design.region import Region
 from design.simulations import Simulations, simulate_designs
 from design.targets.conditions import Conditions
 from design.targets.measured import Measured
@@ -25,6 +28,7 @@ from design.task import Task
 from torchfilm import checks
 
 LEAST = 50  # simulations that succeeded
+DRAWN = 4000  # samples, by which the region of the next round is chosen
 
 
 @checks.known_keywords
@@ -34,6 +38,7 @@ def infer(
     observed: Observed | Measured | Conditions,
     *,
     simulations: int = 5000,
+    rounds: int = 1,
     cells: int | None = None,
     until: float | None = None,
     replicates: int | None = None,
@@ -60,6 +65,10 @@ def infer(
     observed, whose statistics are averaged. From these, neural posterior estimation
     (`NeuralPosterior` names the sources) learns the density of the parameters, given statistics.
     Simulations that fail are left out, so the posterior is that of colonies that do not.
+    rounds: with more than 1, the simulations of each further round lie where those before leave the
+    parameters, with a margin, so that few give narrow intervals; the posterior is then for these
+    data alone. Each round learns from all simulations within its region (truncation: Miller et al.,
+    arXiv 2107.01214; Deistler et al., arXiv 2210.04815).
     observed: the data; or measures of your own, `Measured`, whose spreads are the standard errors
     of the wanted values; or `Conditions` of the data of each condition, such as a dose response:
     each replicate is then a colony under each condition, with random numbers of its own.
@@ -76,11 +85,7 @@ def infer(
     """
     require_sbi()
     data = checked_data(observed)
-    for name, value, least in (
-        ("simulations", simulations, LEAST), ("samples", samples, 10), ("flows", flows, 1),
-        ("epochs", epochs, 1),
-    ):  # fmt: skip
-        checks.integer(name, value, least=least)
+    _check_counts(simulations, rounds, samples=samples, flows=flows, epochs=epochs)
     _check_end(data.time, cells, until)
     kept = None if path is None else checks.file_path("path", path)
     task = Task(
@@ -89,13 +94,25 @@ def infer(
         fixed=fixed, seed=seed, dt=dt, dtype=dtype, device=device, replay=False,
     )  # fmt: skip
     known = Prior(task.space, prior)
-    found = _simulate(task, known, simulations, kept, executor, progress)
-    with open_bar(flows, progress, "infer", counted="flows") as bar:
-        estimator = _learn(found, seed, flows, epochs, bar)
+    estimation = _Estimation(seed, flows, epochs, progress, np.array(data.spread))
+    found, estimator = _in_rounds(
+        task, known, data, simulations, rounds, kept, executor, estimation
+    )
     posterior = Posterior.of(task, known, found, estimator, data, samples)
     if posterior.other_sizes:
-        warnings.warn(posterior.other_sizes, stacklevel=3)
+        checks.warn(posterior.other_sizes)
     return posterior
+
+
+def _check_counts(simulations: int, rounds: int, *, samples: int, flows: int, epochs: int) -> None:
+    for name, value, least in (
+        ("simulations", simulations, LEAST), ("rounds", rounds, 1), ("samples", samples, 10),
+        ("flows", flows, 1), ("epochs", epochs, 1),
+    ):  # fmt: skip
+        checks.integer(name, value, least=least)
+    if simulations < LEAST * rounds:
+        rule = f"at least {LEAST} for each of {rounds} rounds"
+        raise checks.input_error("simulations", simulations, rule)
 
 
 def _check_end(seen: float | None, cells: int | None, until: float | None) -> None:
@@ -109,38 +126,80 @@ def _check_end(seen: float | None, cells: int | None, until: float | None) -> No
         raise checks.input_error("until", until, rule)
 
 
-def _learn(found: Simulations, seed: int, flows: int, epochs: int, bar: Any) -> NeuralPosterior:
-    """The density of the parameters, given statistics."""
-    rows = found.sound
+@dataclass(frozen=True)
+class _Estimation:
+    """How a density is learnt."""
 
-    def begun(flow: int) -> None:
-        if bar is not None:
-            bar.update(flow - bar.n)
-            bar.set_postfix_str(f"learning flow {flow + 1} of {flows}")
+    seed: int
+    flows: int
+    epochs: int
+    progress: bool | None
+    unit: np.ndarray
 
-    given = found.points[rows], found.statistics[rows]
-    learnt = NeuralPosterior.learn(*given, seed=seed, flows=flows, epochs=epochs, begun=begun)
-    advance(bar, 1)
-    return learnt
+    def learn(self, found: Simulations, region: Region) -> NeuralPosterior:
+        """The density of the parameters, given statistics, within a region."""
+        rows = found.within(region)
+        with open_bar(self.flows, self.progress, "infer", counted="flows") as bar:
+
+            def begun(flow: int) -> None:
+                if bar is not None:
+                    bar.update(flow - bar.n)
+                    bar.set_postfix_str(f"learning flow {flow + 1} of {self.flows}")
+
+            learnt = NeuralPosterior.learn(
+                found.points[rows], found.statistics[rows], unit=self.unit, region=region,
+                seed=self.seed, flows=self.flows, epochs=self.epochs, begun=begun,
+            )  # fmt: skip
+            advance(bar, 1)
+        return learnt
+
+
+def _in_rounds(
+    task: Task,
+    prior: Prior,
+    data: Observed,
+    count: int,
+    rounds: int,
+    path: Path | None,
+    executor: Executor | None,
+    estimation: _Estimation,
+) -> tuple[Simulations, NeuralPosterior]:
+    """The simulations of all rounds, and what the last has learnt. A file knows the regions of the
+    rounds that have begun, so that going on with it learns nothing twice."""
+    plan = None if rounds == 1 else (count, rounds)
+    simulate = partial(
+        simulate_designs, task, prior=prior, rounds=plan, path=path, executor=executor
+    )
+    regions: tuple[Region, ...] = (Region.whole(task.space.size),)
+    while True:
+        upto = count * len(regions) // rounds
+        found = _simulate(simulate, regions, upto, task.replicates, estimation.progress)
+        if len(found.regions) > len(regions):
+            regions = found.regions[: len(regions) + 1]
+            continue
+        learnt = estimation.learn(found, regions[-1])
+        if len(regions) == rounds:
+            return found, learnt
+        drawn = learnt.sample(np.array([data.values]), DRAWN, seed=estimation.seed)[0]
+        regions += (regions[-1].around(drawn, task.space.moving, upto),)
 
 
 def _simulate(
-    task: Task,
-    prior: Prior,
+    simulate: Callable[..., Simulations],
+    regions: tuple[Region, ...],
     count: int,
-    path: Path | None,
-    executor: Executor | None,
+    each: int,
     progress: bool | None,
 ) -> Simulations:
-    """The simulations of a task. Raises InputError where too few succeed."""
-    each = task.replicates
+    """The first `count` simulations of a task, of `each` replicates. Raises InputError where too
+    few succeed within the last region."""
     with open_bar(count * each, progress, "infer") as bar:
         seen = lambda known: advance(bar, known * each - (bar.n if bar else 0))
-        found = simulate_designs(task, count, prior=prior, path=path, executor=executor, seen=seen)
-    sound = int(found.sound.sum())
+        found = simulate(count, regions=regions, seen=seen)
+    sound = int(found.within(regions[-1]).sum())
     if sound < LEAST:
         raise tf.InputError(
-            f"{sound} of {count} simulations succeeded, and {LEAST} are needed; the most frequent"
-            f" reason of failure: {found.failures()[0][0]}"
+            f"{sound} of {count - regions[-1].start} simulations succeeded, and {LEAST} are needed;"
+            f" the most frequent reason of failure: {found.failures()[0][0]}"
         )
     return found

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import io
 import math
-import warnings
 from collections.abc import Callable
 from contextlib import redirect_stdout
 from dataclasses import dataclass
@@ -18,30 +17,108 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.quiet import ALONE, alone_and_quiet
+from design.region import Region
 
 EDGE = 1e-6  # coordinates this close to a bound count as so close
 FARTHEST = 10.0  # standard deviations: statistics farther off count as so far
 CONSTANT = 1e-9  # a standard deviation, relative to the mean, from which a statistic varies
 SAMPLES_AT_ONCE = 2**16
 # A flow that gives the truths of all simulations this much less density, in the logarithm, than
-# another one or than a straight line through them, has ended in a poor optimum. It is learnt again
-# so often.
+# another one or than the linear regression has ended in a poor optimum. It is learnt again so
+# often.
 POOR, AGAIN = 1.0, 2
-ENOUGH = 5  # simulations for each statistic; a line through fewer fits them better than others
+WIDE = 30.0  # errors: statistics that vary by more between simulations are compressed
+ENOUGH = 5  # simulations for each statistic; a regression on fewer fits them better than others
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """A linear regression of parameters on statistics.
+
+    weights: (1 + K', D); root: (D, D), the Cholesky factor of the residuals' covariance.
+    """
+
+    weights: Tensor
+    root: Tensor
+
+    @staticmethod
+    def of(theta: Tensor, x: Tensor) -> Regression:
+        """Of theta (n, D) on x (n, K')."""
+        given = _with_one(x)
+        weights = torch.linalg.lstsq(given, theta, driver="gelsd").solution
+        left = theta - given @ weights
+        spread = left.T @ left / len(left) + CONSTANT * torch.eye(left.shape[1], dtype=left.dtype)
+        return Regression(weights, torch.linalg.cholesky(spread))
+
+    @staticmethod
+    def none(theta: Tensor, x: Tensor) -> Regression:
+        """What leaves theta as it is."""
+        size = theta.shape[1]
+        return Regression(theta.new_zeros(1 + x.shape[1], size), torch.eye(size, dtype=theta.dtype))
+
+    @property
+    def fit(self) -> float:
+        """The mean logarithm of the density of theta."""
+        return -0.5 * len(self.root) * (math.log(2 * math.pi) + 1.0) - self.log_scale
+
+    @property
+    def log_scale(self) -> float:
+        """By how much the logarithm of the density of residuals is above that of theta."""
+        return float(self.root.diagonal().log().sum())
+
+    def residuals(self, theta: Tensor, x: Tensor) -> Tensor:
+        """Of theta (…, n, D), for x (n, K'), without their covariance."""
+        left = theta - _with_one(x) @ self.weights
+        return torch.linalg.solve_triangular(self.root.T, left, upper=True, left=False)
+
+    def theta(self, residuals: Tensor, x: Tensor) -> Tensor:
+        """The inverse of `residuals`."""
+        return _with_one(x) @ self.weights + residuals @ self.root.T
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """A conditional density of theta = ln(u/(1 − u)), given statistics x.
+
+    density: a normalising flow, of the residuals of the regression.
+    """
+
+    density: Any
+    regression: Regression
+
+    def sample(self, count: int, x: Tensor) -> Tensor:
+        """Samples for each row of x (m, K'): (count, m, D)."""
+        drawn = self.density.sample((count,), condition=x.float()).double()
+        return self.regression.theta(drawn, x)
+
+    def log_density(self, theta: Tensor, x: Tensor) -> Tensor:
+        """Of theta (n, m, D) for each row of x (m, K'): (n, m)."""
+        left = self.regression.residuals(theta, x).float()
+        return self.density.log_prob(left, condition=x.float()).double() - self.regression.log_scale
+
+
+def _with_one(x: Tensor) -> Tensor:
+    return torch.cat([torch.ones_like(x[:, :1]), x], 1)
 
 
 @dataclass(frozen=True, eq=False)
 class NeuralPosterior:
     """The density of parameters, given statistics, as the mean of some normalising flows.
 
-    flows: conditional densities of ln(u/(1 − u)), where u in [0, 1] are the coordinates of
-    parameters. centre, scale: (K',) of the statistics in use; used: which they are, (K,) bool.
+    flows: of ln(u/(1 − u)), where u in [0, 1] are the coordinates of parameters as shares of
+    `region`, within which all samples lie. Over the whole bounds the relation is far from linear,
+    and they have no regression; in a part of them they have. unit: (K,) of the statistics that vary
+    by far more than their errors, else infinite; of these, flows take arsinh(statistic/unit), in
+    which data are as sharp where statistics are small as where they are large. centre, scale: (K',)
+    of those in use; used: which they are, (K,) bool.
     """
 
-    flows: tuple[Any, ...]
+    flows: tuple[Flow, ...]
+    unit: np.ndarray
     centre: Tensor
     scale: Tensor
     used: np.ndarray
+    region: Region
 
     @staticmethod
     @tf.one_torch_thread()  # flows are so small that threads take longer to meet than to compute
@@ -49,12 +126,15 @@ class NeuralPosterior:
         points: np.ndarray,
         statistics: np.ndarray,
         *,
+        unit: np.ndarray | float = 1.0,
+        region: Region | None = None,
         seed: int,
         flows: int,
         epochs: int,
         begun: Callable[[int], None] = lambda _: None,
     ) -> NeuralPosterior:
-        """Learn from simulations: points (n, D) in [0, 1], statistics (n, K), all finite.
+        """Learn from simulations: points (n, D) within the region, by default all in [0, 1],
+        statistics (n, K), all finite. unit: of each statistic, about its error.
 
         The method is that of Papamakarios and Murray (NeurIPS 2016) with masked autoregressive
         flows, by the package sbi; the mean of several flows is less sure of itself than each
@@ -65,24 +145,30 @@ class NeuralPosterior:
         learnt. Needs sbi (the `infer` extra). The state of torch's random numbers is kept.
         """
         require_sbi()
-        spread, level = statistics.std(0), np.abs(statistics).max(0)
+        unit = np.where(statistics.std(0) > WIDE * np.asarray(unit), unit, np.inf)
+        seen = _compressed(statistics, unit)
+        spread, level = seen.std(0), np.abs(seen).max(0)
         used = spread > CONSTANT * np.maximum(level, CONSTANT)
         if not used.any():
             raise tf.InputError(
                 "all simulations have the same statistics: the parameters do not change what was"
                 " observed. Widen their bounds, or observe something else."
             )
-        centre, scale = (torch.tensor(v[used]) for v in (statistics.mean(0), spread))
-        learner = NeuralPosterior((), centre, scale, used)
-        theta, x = _logit(torch.as_tensor(points)).float(), learner._inputs(statistics)
+        centre, scale = (torch.tensor(v[used]) for v in (seen.mean(0), spread))
+        region = region or Region.whole(points.shape[1])
+        theta = _logit(torch.as_tensor(region.widen(points)))
+        x = _scaled(torch.as_tensor(seen[:, used]), centre, scale)
+        line, least = Regression.none(theta, x), -math.inf
+        if len(x) >= ENOUGH * x.shape[1]:
+            known = Regression.of(theta, x)
+            line, least = line if region.is_whole else known, known.fit
         with ALONE, torch.random.fork_rng(devices=[]):
-            return NeuralPosterior(
-                _learn_flows(theta, x, seed, flows, epochs, begun), centre, scale, used
-            )
+            learnt = _learn_flows(theta, x, line, least, seed, flows, epochs, begun)
+        return NeuralPosterior(learnt, unit, centre, scale, used, region)
 
     def _inputs(self, statistics: np.ndarray) -> Tensor:
-        found = (torch.as_tensor(statistics[:, self.used]) - self.centre) / self.scale
-        return found.clamp(-FARTHEST, FARTHEST).float()
+        seen = torch.as_tensor(_compressed(statistics, self.unit)[:, self.used])
+        return _scaled(seen, self.centre, self.scale)
 
     @torch.no_grad()
     @tf.one_torch_thread()
@@ -96,11 +182,12 @@ class NeuralPosterior:
         with ALONE, torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             parts = [
-                torch.cat([flow.sample((share,), condition=some)
+                torch.cat([flow.sample(share, some)
                            for flow, share in zip(self.flows, shares, strict=True) if share])
                 for some in x.split(rows)
             ]  # fmt: skip
-        return torch.sigmoid(torch.cat(parts, 1).double()).transpose(0, 1).contiguous().numpy()
+        found = torch.sigmoid(torch.cat(parts, 1)).transpose(0, 1).contiguous()
+        return self.region.narrow(found.numpy())
 
     @torch.no_grad()
     @tf.one_torch_thread()
@@ -108,12 +195,23 @@ class NeuralPosterior:
         """The logarithm of the density of coordinates, (m, n), for points (m, n, D) and one row of
         statistics each, (m, K)."""
         x = self._inputs(statistics)
-        u = torch.as_tensor(points).transpose(0, 1).clamp(EDGE, 1.0 - EDGE)
-        z = _logit(u).float()
-        each = [flow.log_prob(z, condition=x).double() for flow in self.flows]
+        shares = torch.as_tensor(self.region.widen(points))
+        u = shares.transpose(0, 1).clamp(EDGE, 1.0 - EDGE)
+        each = [flow.log_density(_logit(u), x) for flow in self.flows]
         mixed = torch.logsumexp(torch.stack(each), 0) - math.log(len(each))
-        # from ln(u/(1 − u)) to u
-        return (mixed - (u * (1.0 - u)).log().sum(-1)).transpose(0, 1).numpy()
+        # from ln(u/(1 − u)) to u, and from this to coordinates
+        width = float(np.log(self.region.high - self.region.low).sum())
+        return (mixed - (u * (1.0 - u)).log().sum(-1)).transpose(0, 1).numpy() - width
+
+
+def _compressed(statistics: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """arsinh(statistic/unit), and the statistic itself where its unit is infinite."""
+    finite = np.isfinite(unit)
+    return np.where(finite, np.arcsinh(statistics / np.where(finite, unit, 1.0)), statistics)
+
+
+def _scaled(seen: Tensor, centre: Tensor, scale: Tensor) -> Tensor:
+    return ((seen - centre) / scale).clamp(-FARTHEST, FARTHEST)
 
 
 def require_sbi() -> None:
@@ -138,7 +236,7 @@ class _NoTracker:
     def flush(self) -> None: ...
 
 
-def _learn_flow(theta: Tensor, x: Tensor, seed: int, epochs: int) -> Any:
+def _learn_flow(residuals: Tensor, x: Tensor, seed: int, epochs: int) -> Any:
     """One flow, from its own start and division of the data."""
     # sbi warns of its own imports, and prints when it has converged
     with alone_and_quiet(), redirect_stdout(io.StringIO()):
@@ -146,45 +244,44 @@ def _learn_flow(theta: Tensor, x: Tensor, seed: int, epochs: int) -> Any:
 
         torch.manual_seed(seed)
         learner = NPE(density_estimator="maf", show_progress_bars=False, tracker=_NoTracker())
-        learner.append_simulations(theta, x)
-        batch = min(200, max(2, len(theta) // 10))
+        learner.append_simulations(residuals, x)
+        batch = min(200, max(2, len(residuals) // 10))
         return learner.train(training_batch_size=batch, max_num_epochs=epochs).eval()
 
 
 def _learn_flows(
-    theta: Tensor, x: Tensor, seed: int, flows: int, epochs: int, begun: Callable[[int], None]
-) -> tuple[Any, ...]:
-    """As many flows, without those in poor optima; at least one."""
-    line = _line_fit(theta, x) if len(x) >= ENOUGH * x.shape[1] else -math.inf
-    found: list[tuple[float, Any]] = [(-math.inf, None)] * flows
+    theta: Tensor,
+    x: Tensor,
+    line: Regression,
+    least: float,
+    seed: int,
+    flows: int,
+    epochs: int,
+    begun: Callable[[int], None],
+) -> tuple[Flow, ...]:
+    """As many flows, without those in poor optima; at least one. line: the regression below each;
+    least: the fit of one alone."""
+    left = line.residuals(theta, x).float()
+    found: list[tuple[float, Flow | None]] = [(-math.inf, None)] * flows
     for attempt in range(AGAIN + 1):
-        poor = max(line, *(fit for fit, _ in found)) - POOR
+        poor = max(least, *(fit for fit, _ in found)) - POOR
         for k in range(flows):
             if found[k][1] is not None and found[k][0] >= poor:
                 continue
             begun(k)
-            made = _learn_flow(theta, x, seed + attempt * flows + k, epochs)
+            made = Flow(_learn_flow(left, x.float(), seed + attempt * flows + k, epochs), line)
             with torch.no_grad():
-                fit = float(made.log_prob(theta.unsqueeze(0), condition=x).double().mean())
+                fit = float(made.log_density(theta.unsqueeze(0), x).mean())
             if found[k][1] is None or fit > found[k][0]:
                 found[k] = fit if math.isfinite(fit) else -math.inf, made
     best = max(fit for fit, _ in found)
-    if best < line - POOR:
-        warnings.warn(
-            "The estimator has learnt less from the simulations than a straight line would, so that"
-            " the posterior is too wide. Give more simulations or epochs, or leave out statistics"
-            " (observed.without(…)).",
-            stacklevel=2,
+    if best < least - POOR:
+        tf.checks.warn(
+            "The estimator has learnt less from the simulations than a linear regression would, so"
+            " that the posterior is too wide. Give more simulations or epochs, or leave out"
+            " statistics (observed.without(…))."
         )
-    return tuple(made for fit, made in found if fit >= best - POOR)
-
-
-def _line_fit(theta: Tensor, x: Tensor) -> float:
-    """The mean logarithm of the density of theta (n, D) by a linear regression on x (n, K)."""
-    given, wanted = torch.cat([torch.ones_like(x[:, :1]), x], 1).double(), theta.double()
-    left = wanted - given @ torch.linalg.lstsq(given, wanted, driver="gelsd").solution
-    spread = left.T @ left / len(left) + CONSTANT * torch.eye(left.shape[1], dtype=left.dtype)
-    return -0.5 * float(torch.logdet(2 * math.pi * math.e * spread))
+    return tuple(made for fit, made in found if made is not None and fit >= best - POOR)
 
 
 def _logit(u: Tensor) -> Tensor:

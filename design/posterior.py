@@ -76,6 +76,11 @@ class Posterior:
                 f" ({', '.join(map(str, dict.fromkeys(colonies[1])))})",
                 "Make it with like=…; of Measured, with the same functions and spreads.",
             )
+        if len(self.simulations.regions) > 1:
+            raise checks.input_error(
+                "observed", data.describe(), "left to infer(…), since this posterior was learnt in"
+                " rounds, for its own data alone", "With rounds=1, it holds for others.",
+            )  # fmt: skip
         when = self.observed.time if self.task.until is None else self.task.until
         now = data.time
         if when is not None and now is not None and abs(now - when) > 1e-6 * when:
@@ -177,6 +182,7 @@ class Posterior:
                 line += f"  {100 * share:.0f} % of the samples"
             lines.append(line)
         lines.append(f"from {len(self.simulations)} simulations; {self.observed.describe()}")
+        lines += self._region_words()
         failures = self.simulations.failures()
         lines += [f"{n} simulations failed: {why}" for why, n in failures[:3]]
         if len(failures) > 3:
@@ -189,6 +195,18 @@ class Posterior:
             lines.append("The model does not reach the data within these bounds:")
             lines += [f"  {words}" for words in self.surprises]
         return tf.displays.Text("\n".join(lines))
+
+    def _region_words(self) -> list[str]:
+        """Where the simulations of the last of several rounds lie."""
+        region, rounds = self.estimator.region, len(self.simulations.regions)
+        if rounds < 2:
+            return []
+        parts = []
+        for k in self.task.space.moving:
+            p = self.task.space.parameters[k]
+            low, high = (float(p.value(float(x[k]))) for x in (region.low, region.high))
+            parts.append(f"{p.name} {low:.4g} to {high:.4g}")
+        return [f"in {rounds} rounds; the last within {', '.join(parts) or 'the bounds'}"]
 
     def __repr__(self) -> str:
         return f"Posterior(mean={self.mean}, {len(self.points)} samples)"
@@ -211,10 +229,12 @@ class Posterior:
     def check(self, truths: int = 200, *, samples: int = 999) -> Calibration:
         """Simulation-based calibration (Talts et al., arXiv 1804.06788): grow colonies of hidden,
         random parameters, and see how often the posteriors of their statistics cover these. It
-        costs `truths` simulations and no learning."""
+        costs `truths` simulations and no learning. Of a posterior that was learnt in rounds, the
+        parameters lie within the region of the last."""
         checks.integer("truths", truths, least=2)
         checks.integer("samples", samples, least=9)
-        points = random_points(self.task, self.prior, truths, stream=STREAM)
+        within = self.estimator.region
+        points = random_points(self.task, self.prior, truths, stream=STREAM, region=within)
         found = simulate_points(self.task, points, _first(STREAM))
         hidden, seen = points[found.sound], found.statistics[found.sound]
         drawn = self.estimator.sample(seen, samples, seed=self.task.seed + 1)

@@ -16,8 +16,9 @@ from torchfilm import checks
 
 LIKELY = 3.0  # a loss of simulations above that of a right model and a posterior as it should be
 WIDE = (
-    ", of a right model and a narrow posterior about 2: give infer more simulations, or change the"
-    " model. Where a search has exact derivatives, its best.intervals() needs no simulations."
+    ", of a right model and a narrow posterior about 2: give infer rounds=2 or more simulations, or"
+    " change the model. Where a search has exact derivatives, its best.intervals() needs no"
+    " simulations."
 )
 
 

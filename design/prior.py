@@ -60,6 +60,16 @@ class Prior:
             out[:, k] = [p.coordinate(v) for v in values]
         return out
 
+    def units(self, points: np.ndarray) -> np.ndarray:
+        """The inverse of `points` for parameters without levels; the coordinates of others."""
+        out = points.copy()
+        for k, p in enumerate(self._space.parameters):
+            if p.name in self.given and isinstance(p, Parameter) and not p.whole:
+                low, high = self._shares[p.name]
+                values = [float(p.value(x)) for x in points[:, k]]
+                out[:, k] = (self.given[p.name].cdf(values) - low) / (high - low)
+        return out
+
     def words(self, name: str) -> str:
         """What was given of a parameter, as text."""
         known = self.given[name]

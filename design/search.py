@@ -14,7 +14,7 @@ import numpy as np
 
 import torchfilm as tf
 from design.best import Best
-from design.finals import MOST_SHARE, Finals, FinalsRun, fresh_losses, winner
+from design.finals import MOST_SHARE, Finals, FinalsRun, fresh_losses, is_certain, winner
 from design.front import Front, front_of
 from design.growing import FinishedColonies
 from design.known import KnownDesigns, Start, known_designs
@@ -216,7 +216,6 @@ class Search(TaskOptions):
         the wanted loss."""
         assert self._progress.chosen is not None
         task, method = self.objective.task, self._progress.chosen.method
-        limit = max(colonies - self._reserved(colonies), task.colonies_each)  # one design at least
         seed = task.seed if self.method_seed is None else self.method_seed
         method.start(task.space, seed, task.replicates)
         proposal = repeat_study(method, task, self.study, self._known)
@@ -228,7 +227,12 @@ class Search(TaskOptions):
             proposal = proposal or Proposal.of_number(
                 len(self.study.entries), method, task, self._known
             )
-            room = min(limit - self.study.searched, colonies - self.study.colonies)
+            if finals is not None and self.study.entries and self._may_be_certain:
+                finals.sound()
+            limit = max(colonies - self._reserved(colonies), task.colonies_each)  # one design
+            # earlier finals leave the new ones their share
+            room = limit - self.study.searched - self.study.tested
+            room = min(room, colonies - self.study.colonies)
             part = proposal.part(self.objective, room)
             if part is None:
                 return False
@@ -253,8 +257,14 @@ class Search(TaskOptions):
 
     def _reserved(self, colonies: int) -> float:
         """How many of the colonies are for the finals."""
-        count = self.objective.task.conditions
-        return count * self.finals.colonies(colonies / count) if self.finals else 0.0
+        task = self.objective.task
+        each, certain = colonies / task.conditions, is_certain(task, self.study)
+        return task.conditions * self.finals.colonies(each, certain) if self.finals else 0.0
+
+    @property
+    def _may_be_certain(self) -> bool:
+        """Whether seeds may make no difference, as in fits of circuits without noise."""
+        return self.objective.least_squares and not self.objective.task.target.pattern
 
     def _reached(self, stop_at: float | None, finals: FinalsRun | None) -> bool:
         """Whether the best design so far has the wanted loss, and holds it where it is tested."""

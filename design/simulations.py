@@ -6,9 +6,9 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from design.executors import check_executor
 from design.growing import FailedColony, grow
 from design.parameters import Value
 from design.prior import Prior
+from design.region import Region
 from design.scoring import WorkItem, cut_work_items
 from design.targets.observed import Observed
 from design.targets.observed_conditions import averaged, checked_data, errors, places
@@ -41,13 +42,14 @@ class Simulations:
 
     points: coordinates of the parameters, (n, D) in [0, 1]; statistics: (n, K), means
     over the colonies of each, NaN where one of them failed. cells: (n,) of each, the mean of its
-    colonies. reasons: of failures, by row.
+    colonies. reasons: of failures, by row. regions: of the rounds of inference that have begun.
     """
 
     points: np.ndarray
     statistics: np.ndarray
     cells: np.ndarray
     reasons: dict[int, str] = field(default_factory=dict)
+    regions: tuple[Region, ...] = ()
 
     def __len__(self) -> int:
         return len(self.points)
@@ -61,7 +63,12 @@ class Simulations:
         """Some of them, from the first on."""
         start, stop, _ = rows.indices(len(self))
         reasons = {k - start: words for k, words in self.reasons.items() if start <= k < stop}
-        return Simulations(self.points[rows], self.statistics[rows], self.cells[rows], reasons)
+        arrays = self.points[rows], self.statistics[rows], self.cells[rows]
+        return Simulations(*arrays, reasons, self.regions)
+
+    def within(self, region: Region) -> np.ndarray:
+        """Those that did not fail and lie within a region, (n,) bool."""
+        return self.sound & region.holds(self.points)
 
     def followed_by(self, other: Simulations) -> Simulations:
         moved = {k + len(self): words for k, words in other.reasons.items()}
@@ -70,6 +77,7 @@ class Simulations:
             np.concatenate([self.statistics, other.statistics]),
             np.concatenate([self.cells, other.cells]),
             self.reasons | moved,
+            self.regions,
         )
 
     def failures(self) -> list[tuple[str, int]]:
@@ -83,12 +91,17 @@ def observed_of(task: Task) -> Observed:
     return checked_data(task.target)
 
 
-def about(task: Task, prior: Prior) -> dict[str, Any]:
-    """What simulations depend on, as plain data: all of the task but the observed numbers."""
+def about(task: Task, prior: Prior, rounds: tuple[int, int] | None = None) -> dict[str, Any]:
+    """What simulations depend on, as plain data: all of the task but the observed numbers, which
+    those of several rounds depend on, too. rounds: how many simulations, in how many rounds."""
     found = task.describe() | {"target": repr(observed_of(task).plan)}
     del found["code of the target"], found["reduce"]
     if prior.given:
         found["prior"] = prior.describe()
+    if rounds is not None:
+        data = observed_of(task)
+        found["simulations and rounds"] = list(rounds)
+        found["observed numbers"] = [list(map(float, v)) for v in (data.values, data.spread)]
     return found
 
 
@@ -97,6 +110,8 @@ def simulate_designs(
     count: int,
     *,
     prior: Prior | None = None,
+    regions: tuple[Region, ...] = (),
+    rounds: tuple[int, int] | None = None,
     path: Path | None = None,
     executor: Executor | None = None,
     seen: Callable[[int], None] = lambda count: None,
@@ -104,25 +119,30 @@ def simulate_designs(
     """Simulate `count` designs with parameters drawn from the prior (by default evenly), each with
     `task.replicates` colonies, under each condition, and random numbers of its own.
 
-    path: of the file that keeps them; those that it holds are not simulated again. executor: of the
-    `concurrent.futures` kind. seen: called with the number of designs that are known. Simulation
-    k is the same in any batch and on any machine of the same kind. Raises InputError for an
-    executor that would hang.
+    regions: of the rounds that have begun, by their first simulations; by default one of all
+    values. rounds: how many simulations in how many rounds, where there are several. path: of the
+    file that keeps them and the regions; those that it holds are not simulated again. executor: of
+    the `concurrent.futures` kind. seen: called with the number of designs that are known.
+    Simulation k is the same in any batch and on any machine of the same kind. Raises InputError for
+    an executor that would hang.
     """
     if executor is not None:
         check_executor(executor)
     prior = prior or Prior(task.space)
     before = None if path is None else stamp(path)
-    known = _read(path, task, prior)
+    kept = about(task, prior, rounds)
+    known = _read(path, task, kept)
+    if len(regions) > len(known.regions):
+        known = replace(known, regions=regions)
     seen(min(count, len(known)))
-    draws = np.random.default_rng(task.seed)
-    points = prior.points(draws.random((max(count, len(known)), task.space.size)))
+    draws = np.random.default_rng(task.seed).random((max(count, len(known)), task.space.size))
+    points = _points(prior, draws, known.regions)
     starts = range(len(known), count, BATCH)
     parts = [(first, points[first : min(first + BATCH, count)]) for first in starts]
     run = partial(_simulate_part, task)
     for found in map(run, parts) if executor is None else executor.map(run, parts):
         known = known.followed_by(found)
-        before = _write(path, task, prior, known, before)
+        before = _write(path, task, kept, known, before)
         seen(len(known))
     return known.take(slice(0, count))
 
@@ -208,10 +228,25 @@ def _means(found: np.ndarray, count: np.ndarray) -> np.ndarray:
     return (found * within).sum(1) / count
 
 
-def random_points(task: Task, prior: Prior, count: int, *, stream: int) -> np.ndarray:
-    """Further random designs, (n, D), none of those that `simulate_designs` draws."""
-    draws = np.random.default_rng([task.seed, stream])
-    return prior.points(draws.random((count, task.space.size)))
+def _points(prior: Prior, draws: np.ndarray, regions: Sequence[Region]) -> np.ndarray:
+    """Designs of the prior, (n, D), from even draws; each lies in the last region that begins no
+    later."""
+    found = prior.points(draws)
+    for region in regions:
+        if not region.is_whole:
+            low, high = prior.units(np.stack([region.low, region.high]))
+            later = low + (high - low) * draws[region.start :]
+            found[region.start :] = prior.points(later).clip(region.low, region.high)
+    return found
+
+
+def random_points(
+    task: Task, prior: Prior, count: int, *, stream: int, region: Region | None = None
+) -> np.ndarray:
+    """Further random designs, (n, D), within a region, by default anywhere; none of those that
+    `simulate_designs` draws."""
+    draws = np.random.default_rng([task.seed, stream]).random((count, task.space.size))
+    return _points(prior, draws, [] if region is None else [replace(region, start=0)])
 
 
 def shown_values(task: Task, points: np.ndarray) -> dict[str, list[Value]]:
@@ -221,15 +256,17 @@ def shown_values(task: Task, points: np.ndarray) -> dict[str, list[Value]]:
 
 
 def _write(
-    path: Path | None, task: Task, prior: Prior, known: Simulations, before: Stamp | None
+    path: Path | None, task: Task, kept: Mapping[str, Any], known: Simulations, before: Stamp | None
 ) -> Stamp | None:
-    """In place of the older file, where there is one, whose `stamp` is `before`; the new one."""
+    """In place of the older file, where there is one, whose `stamp` is `before`; the new one. kept:
+    what the simulations are `about`."""
     if path is None:
         return None
-    kept = "earlier simulations"
-    with replacing(path, FORMAT, VERSION, about(task, prior), kept, before) as file:
+    with replacing(path, FORMAT, VERSION, kept, "earlier simulations", before) as file:
         file["points"], file["statistics"] = known.points, known.statistics
         file["cells"] = known.cells
+        file["regions"] = np.array([[r.low, r.high] for r in known.regions])
+        file["starts of regions"] = [r.start for r in known.regions]
         names = list(observed_of(task).plan.names)
         file.create_dataset("names", data=names, dtype=h5py.string_dtype())
         for name, column in shown_values(task, known.points).items():
@@ -239,19 +276,27 @@ def _write(
     return mark
 
 
-def _read(path: Path | None, task: Task, prior: Prior) -> Simulations:
+def _read(path: Path | None, task: Task, about: Mapping[str, Any]) -> Simulations:
     """What a file holds; nothing where there is none. Raises InputError for the file of another
     task and for one that cannot be read."""
     names = observed_of(task).plan.names
+    regions: tuple[Region, ...] = (Region.whole(task.space.size),)
     if path is None or not path.exists():
-        return Simulations(np.empty((0, task.space.size)), np.empty((0, len(names))), np.empty(0))
+        nothing = np.empty((0, task.space.size)), np.empty((0, len(names))), np.empty(0)
+        return Simulations(*nothing, {}, regions)
     with reading(path, FORMAT, VERSION, "file of simulations") as file:
-        kept, mine = json.loads(file.attrs["about"]), about(task, prior)
+        kept, mine = json.loads(file.attrs["about"]), dict(about)
         reasons = {int(k): words for k, words in json.loads(file.attrs["reasons"]).items()}
         points, cells = file["points"][...], np.full(len(file["points"]), np.nan)
         if "cells" in file:  # older files have none
             cells = file["cells"][...]
-        found = Simulations(points, file["statistics"][...], cells, reasons)
+        if "regions" in file:  # older files are of one round
+            starts = file["starts of regions"][...].tolist()
+            regions = tuple(
+                Region(ends[0], ends[1], start)
+                for ends, start in zip(file["regions"][...], starts, strict=True)
+            )
+        found = Simulations(points, file["statistics"][...], cells, reasons, regions)
         kept["statistics"] = [n.decode() for n in file["names"][...]]
     mine["statistics"] = list(names)
     plain = json.loads(json.dumps(mine))

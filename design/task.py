@@ -7,7 +7,6 @@ import dataclasses
 import math
 import operator
 import re
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
@@ -144,10 +143,9 @@ class Task(TaskOptions):
         self._set(fixed=fixed, until=until, dt=dt, family=family, tried=tried)
         if until is not None and self.cells is None and tried.growth * until > math.log(TOO_MANY):
             power = tried.growth * until / math.log(10.0)
-            warnings.warn(
+            checks.warn(
                 f"until = {until:g} h: at {tried.growth:.3g}/h, a cell becomes 10^{power:.0f} cells"
-                " by then. Are times in hours, and rates in 1/h?",
-                stacklevel=3,
+                " by then. Are times in hours, and rates in 1/h?"
             )
 
     def _set(self, **values: Any) -> None:

@@ -45,7 +45,29 @@ def test_a_fit_gives_back_what_is_linear():
     state = model.start()
     found = CostProbe(model, blocks, state, state, "", True, 1.0).fit("seconds")
     for title, expected in truth.items():
-        assert found[title] == pytest.approx(expected, rel=1e-6, abs=1e-12), title
+        cost = found[title]
+        assert (cost.a, cost.b, cost.c) == pytest.approx(expected, rel=1e-6, abs=1e-12), title
+    assert {t for t in truth if found[t].crowding} == {"mechanics"}
+
+
+@pytest.mark.parametrize(("drag", "power"), [(None, 1.65), (10.0, 1.0)])
+def test_contacts_of_large_colonies_in_free_growth_cost_more_a_cell(drag, power):
+    model = tf.Scene(*BODY[:2], tf.Mechanics(dim=2, length_drag=drag)).bind()
+    blocks = [Block(n, 1, {e.title: 1e-5 * n for e in model.effects}, {}) for n in (32, 64)]
+    state = model.start()
+    costs = CostProbe(model, blocks, state, state, "", True, 1.0).fit("seconds")
+    contacts, growth = costs["mechanics"], costs["growth"]
+    assert contacts.of(1, 3) == pytest.approx(3e-5)
+    for cost, wanted in ((contacts, power), (growth, 1.0)):
+        ratio = cost.of(1e5, 2) / cost.of(1e4, 2)
+        assert ratio == pytest.approx(10**wanted, rel=1e-6)
+
+
+@pytest.mark.parametrize("drag", [None, 10.0])
+def test_explain_says_by_which_power(drag):
+    scene = tf.Scene(*BODY[:2], tf.Mechanics(dim=2, length_drag=drag))
+    said = tf.explain(scene, cells=1000, seconds=0.05)
+    assert ("contacts of larger colonies as their cells^1.65" in said) == (drag is None)
 
 
 def test_a_run_is_predicted_from_the_pace_of_growth():

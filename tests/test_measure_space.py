@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -82,7 +83,27 @@ def test_noise_has_no_correlation_and_equal_pairs_have_one():
     assert float(tf.measure.correlation(same, "y", [0, 0.1])) == pytest.approx(1.0)
 
 
-def test_colonies_do_not_see_one_another_and_blocks_do_not_matter(monkeypatch):
+@pytest.mark.parametrize("periodic", [None, {"x": (-3.0, 17.0)}])
+@pytest.mark.parametrize("edges", [[0.0, 1.0, 3.0, 30.0], [0.5, 2.0, 4.0]])
+def test_the_correlation_is_the_sum_over_all_pairs(periodic, edges):
+    """Also of cells at one place, at the edge of a bin, and beyond a face."""
+    rng = np.random.default_rng(3)
+    place = np.r_[rng.uniform(-2, 16, (60, 2)), [[1.0, 1.0]] * 3, [[2.0, 1.0], [3.0, 3.0]]]
+    y = rng.normal(size=len(place))
+    x = place[:, None] - place
+    if periodic is not None:
+        x[..., 0] -= 20.0 * np.round(x[..., 0] / 20.0)
+    r, product = np.hypot(*x.transpose(2, 0, 1)), np.multiply.outer(y - y.mean(), y - y.mean())
+    others = ~np.eye(len(y), dtype=bool)
+    wanted = [
+        product[(r >= low) & (r < high) & others].mean() / y.var()
+        for low, high in itertools.pairwise(edges)
+    ]
+    found = tf.measure.correlation(lawn(y, place, periodic), "y", torch.tensor(edges))
+    assert found[0].tolist() == pytest.approx(wanted, rel=1e-9)
+
+
+def test_colonies_do_not_see_one_another():
     rng = np.random.default_rng(1)
     place, owner = rng.uniform(0, 10, (90, 2)), np.repeat([0, 1, 2], 30)
     state = lawn(rng.normal(size=90), place, colony=owner)
@@ -90,8 +111,6 @@ def test_colonies_do_not_see_one_another_and_blocks_do_not_matter(monkeypatch):
     alone = state.select([1])
     for whole, m in zip(both, (tf.measure.profile, tf.measure.correlation), strict=True):
         assert torch.equal(m(alone, "y", EDGES)[0], whole[1])
-    monkeypatch.setattr("torchfilm.spatial.BLOCK", 7)
-    torch.testing.assert_close(tf.measure.correlation(state, "y", EDGES), both[1])
     flat = lawn(np.ones(5), rng.uniform(0, 5, (5, 2)))
     assert bool(tf.measure.correlation(flat, "y", EDGES).isnan().all())
 

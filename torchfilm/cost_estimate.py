@@ -2,7 +2,8 @@
 
 The scene runs briefly with a small crowd of cells, once in a single colony and once in several. A
 least-squares fit gives the time and bytes of each effect: a + b · cells, or a + b · colonies for
-effects on grids.
+effects on grids. The cost of contacts in larger colonies than these is extrapolated by the power
+that was measured.
 """
 
 from __future__ import annotations
@@ -77,6 +78,23 @@ class Block:
 
 
 @dataclass(frozen=True)
+class Cost:
+    """Of an effect in one step: a + b · cells + c · colonies; in colonies of more than `crowd`
+    cells, b grows as their number to the power `crowding`."""
+
+    a: float
+    b: float
+    c: float
+    crowding: float = 0.0
+    crowd: float = PROBE_CELLS
+
+    def of(self, cells: float, colonies: int) -> float:
+        """For a number of cells in each of so many colonies."""
+        grown = max(1.0, cells / self.crowd) ** self.crowding
+        return self.a + self.b * grown * cells * colonies + self.c * colonies
+
+
+@dataclass(frozen=True)
 class CostProbe:
     """The measurement of a scene's first steps.
 
@@ -93,19 +111,25 @@ class CostProbe:
     laid: bool
     seconds: float
 
-    def fit(self, what: str) -> dict[str, tuple[float, float, float]]:
-        """Fits "seconds" or "bytes" of a step by a + b · cells + c · colonies: (a, b, c) ≥ 0 by
-        effect, by least squares of the relative errors. A grid is per colony, all else per cell: so
-        effects on grids have b = 0, the others c = 0."""
+    def fit(self, what: str) -> dict[str, Cost]:
+        """Fits "seconds" or "bytes" of a step by a + b · cells + c · colonies ≥ 0, by effect, by
+        least squares of the relative errors. A grid is per colony, all else per cell: so effects on
+        grids have b = 0, the others c = 0."""
         found = {}
         for title in self.blocks[0].seconds:
-            on_grid = any(e.title == title and e.works_on_grid for e in self.model.effects)
+            effects = [e for e in self.model.effects if e.title == title]
+            on_grid = any(e.works_on_grid for e in effects)
+            # only their time: the bytes of contacts are in proportion to the cells
+            power = sum(e.effect.crowding for e in effects) if what == "seconds" else 0.0
+            crowd = max(1.0, float(self.last.counts.max()))
             blocks = [block for block in self.blocks if getattr(block, what)]
             rows = [(1.0, float(block.colonies if on_grid else block.cells)) for block in blocks]
             value = np.array([getattr(block, what)[title] for block in blocks], dtype=float)
             weight = 1.0 / np.maximum(value, 1e-9)
             (start, slope), _ = nnls(np.array(rows) * weight[:, None], value * weight)
-            found[title] = (start, 0.0, slope) if on_grid else (start, slope, 0.0)
+            found[title] = (
+                Cost(start, 0.0, slope) if on_grid else Cost(start, slope, 0.0, power, crowd)
+            )
         return found
 
 
@@ -226,7 +250,7 @@ def cost_lines(
         return [f"estimated cost: none, since the first step failed: {seen.failed}"]
     spent, allocated = seen.fit("seconds"), seen.fit("bytes")
     total = cells * colonies
-    each = {title: value(abc, total, colonies) for title, abc in spent.items()}
+    each = {title: cost.of(cells, colonies) for title, cost in spent.items()}
     step = sum(each.values())
     shares = ", ".join(
         f"{title} {100 * t / step:.0f} %"
@@ -234,7 +258,8 @@ def cost_lines(
         if t >= 0.005 * step
     )
     per_cell, per_grid = state_bytes(seen.last)
-    working = sum(value(abc, total, colonies) for abc in allocated.values())
+    power = max(cost.crowding for cost in spent.values())
+    working = sum(cost.of(cells, colonies) for cost in allocated.values())
     where = f"{cells} cells" + (f" in each of {colonies} colonies" if colonies > 1 else "")
     start = f"{ROWS * COLUMNS} cells laid side by side" if seen.laid else "the founders"
     lines = [
@@ -254,28 +279,19 @@ def cost_lines(
             f" {ALONE_BLOCKS * BLOCK_STEPS} steps of one colony, then {seen.last.step} of"
             f" {seen.last.colonies}, to {seen.last.cells} cells in all;"
         ),
-        "           fitted by a + b · cells, for grids a + b · colonies",
+        "           fitted by a + b · cells, for grids a + b · colonies"
+        + (f"; contacts of larger colonies as their cells^{1 + power:g}" if power else ""),
         (
-            "           an estimate, to a factor of two or three: larger colonies take more"
-            " iterations to solve, circuits may take more steps later,"
+            "           an estimate, to a factor of two or three"
+            " (less sure for far larger colonies than these): pressure slows growth, circuits may"
+            " take more steps later,"
         ),
         "           and other work on the machine counts too",
     ]
     return lines + ([f"  warning  a probe failed: {seen.failed}"] if seen.failed else [])
 
 
-def value(abc: tuple[float, float, float], cells: float, colonies: float) -> float:
-    """a + b · cells + c · colonies."""
-    return abc[0] + abc[1] * cells + abc[2] * colonies
-
-
-def _run(
-    scene: Scene,
-    seen: CostProbe,
-    spent: dict[str, tuple[float, float, float]],
-    cells: int,
-    colonies: int,
-) -> str:
+def _run(scene: Scene, seen: CostProbe, spent: dict[str, Cost], cells: int, colonies: int) -> str:
     """Steps and time of a run from the founders to `cells` cells, at the growth rate of the probe's
     volume."""
     before, after = (max(1e-30, float(state.volume.sum())) for state in (seen.first, seen.last))
@@ -285,9 +301,7 @@ def _run(
     start = scene.founders.count / scene.founders.colonies
     steps = math.ceil(max(0.0, math.log2(cells / max(1.0, start))) / pace)
     taken = sum(
-        value(abc, start * 2 ** (pace * k) * colonies, colonies)
-        for k in range(steps)
-        for abc in spent.values()
+        cost.of(start * 2 ** (pace * k), colonies) for k in range(steps) for cost in spent.values()
     )
     leave = any(effect.stage in (LYSIS, REMOVAL) for effect in scene.effects)
     return (

@@ -85,6 +85,7 @@ class Effect(metaclass=checks.KnownKeywords):
     # Its cost depends on the voxels of the grid, not on the cells.
     works_on_grid: ClassVar[bool] = False
     usual_first: ClassVar[float] = 1.0  # what hints suggest for a variable that it needs
+    crowding: float = 0.0  # its cost for each cell grows as this power of a colony's cells
 
     def __init_subclass__(cls, **given: Any) -> None:
         """Have physical values checked before a `__post_init__` of the class's own, also where that

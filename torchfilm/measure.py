@@ -364,8 +364,7 @@ def correlation(state: State, name: str | Tensor, edges: row_checks.Numbers) -> 
     maximum beyond 0 is the wavelength of a pattern. NaN without pairs, or variance.
 
     name: as for `profile`. edges: of the bins, K + 1 of them, µm, ascending from 0 or more. In a
-    periodic space distances are those to the nearest image. It takes all pairs: a second for some
-    10,000 cells."""
+    periodic space distances are those to the nearest image."""
     value = quantity("correlation", state, name)
     return pair_correlation(state, value, checked_edges("correlation", edges, 0.0))
 

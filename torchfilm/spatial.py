@@ -7,14 +7,14 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
-
-BLOCK = 2048  # cells whose distances to all others of their colony are in memory at once
 
 
 def quantity(measure: str, state: State, name: object) -> Tensor:
@@ -51,7 +51,8 @@ def kinds_of(measure: str, state: State, name: object) -> Tensor:
 
 def checked_edges(measure: str, edges: Any, least: float = -torch.inf) -> list[float]:
     """Ascending edges of bins, µm. Raises InputError, which names the measure, for others."""
-    found = [checks.number(f"{measure}(edges)", e, least=least) for e in edges]
+    given = edges.tolist() if isinstance(edges, Tensor) else edges
+    found = [checks.number(f"{measure}(edges)", e, least=least) for e in given]
     if len(found) < 2 or any(b <= a for a, b in itertools.pairwise(found)):
         raise checks.input_error(f"{measure}(edges)", list(edges), "two or more, µm, ascending")
     return found
@@ -70,33 +71,26 @@ def binned_mean(groups: Groups, value: Tensor, place: Tensor, edges: Sequence[fl
 
 def pair_correlation(state: State, value: Tensor, edges: Sequence[float]) -> Tensor:
     """See `measure.correlation`; (B, K)."""
-    limits, bins = value.new_tensor(edges), len(edges) - 1
-    found = value.new_full((state.colonies, bins), torch.nan)
+    found = np.full((state.colonies, len(edges) - 1), np.nan)
+    # a bin holds its lower edge, and not its upper one
+    limits = np.nextafter(np.array(edges), -np.inf)
     counts = state.counts.tolist()
-    parts = zip(value.split(counts), state.position.double().split(counts), strict=True)
+    space, box = state.space, None
+    where = state.position if space is None else space.inside(state.position)
+    if space is not None:
+        box = np.array(space.period)  # 0 along an axis without faces
+        where = where - where.new_tensor(space.low)
+    parts = zip(value.cpu().split(counts), where.double().cpu().split(counts), strict=True)
     for colony, (own, place) in enumerate(parts):
-        if not len(own):
+        apart = (own - own.mean()).numpy()
+        if not len(apart) or not apart.any():
             continue
-        apart = own - own.mean()
-        sums, pairs = value.new_zeros(bins), value.new_zeros(bins)
-        for first in range(0, len(own), BLOCK):
-            rows = slice(first, first + BLOCK)
-            distance = _distances(state, place[rows], place)
-            at = torch.bucketize(distance, limits, right=True) - 1
-            at[torch.arange(len(at)), torch.arange(first, first + len(at))] = -1  # with itself
-            inside = (at >= 0) & (at < bins)
-            product = (apart[rows, None] * apart)[inside]
-            sums += torch.bincount(at[inside], product, minlength=bins)
-            pairs += torch.bincount(at[inside], minlength=bins)
-        found[colony] = sums / pairs / apart.square().mean()
-    return found
-
-
-def _distances(state: State, one: Tensor, other: Tensor) -> Tensor:
-    """Between places (n, d) and (m, d), (n, m) µm; in a periodic space to the nearest image."""
-    square = one.new_zeros(len(one), len(other))
-    for k in range(one.shape[1]):
-        x = one[:, k, None] - other[:, k]
-        x = x if state.space is None else x + state.space.shift_along(k, x)
-        square += x * x
-    return square.sqrt()
+        tree = cKDTree(place.numpy(), boxsize=box)
+        sums = tree.count_neighbors(tree, limits, weights=(apart, apart), cumulative=False)
+        pairs = tree.count_neighbors(tree, limits, cumulative=False)
+        if edges[0] == 0.0:  # pairs at one place, but for each cell with itself
+            sums[1] += sums[0] - np.square(apart).sum()
+            pairs[1] += pairs[0] - len(apart)
+        with np.errstate(invalid="ignore"):
+            found[colony] = sums[1:] / pairs[1:] / np.square(apart).mean()
+    return value.new_tensor(found)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import operator
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
@@ -194,11 +193,10 @@ class Wiring:
         """Warn of gates that others stand in for."""
         other = [f"{n} = {chosen[n].name}" for n in self.places if chosen[n].name != design[n]]
         if other:
-            warnings.warn(
+            checks.warn(
                 f"the gates {', '.join(design[n] for n in self.places)} would use a repressor"
                 f" twice, or their levels would not fit: {', '.join(other)}"
-                f" stand{'s' if len(other) == 1 else ''} in. resolve(design) gives those in use.",
-                stacklevel=3,
+                f" stand{'s' if len(other) == 1 else ''} in. resolve(design) gives those in use."
             )
 
     def _rates(self) -> Callable[..., dict[str, Any]]:

@@ -160,9 +160,9 @@ def _fits(cloud: CMAES, data: str, after: int) -> tuple[Chosen, ...]:
     """Descents of a fit to data, from one start and from more, side by side."""
     return tuple(
         Chosen(
-            Polish(inner=cloud, after=after, starts=starts),
+            Polish(inner=cloud, after=after, starts=starts, again=True),
             f"{data}; {after} designs of CMA-ES, then by gradients from the best, since the loss is"
-            " a sum of squares with exact derivatives",
+            " a sum of squares with exact derivatives; and so again",
         )
         for starts in range(1, MOST_STARTS + 1)
     )

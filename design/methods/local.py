@@ -128,11 +128,16 @@ class Descent:
         )
 
 
+def near(point: np.ndarray, others: np.ndarray) -> bool:
+    """Whether a point (D,) is like one of others (n, D)."""
+    return bool((np.abs(others - point).max(1) < APART).any())
+
+
 def unlike(points: np.ndarray, loss: np.ndarray, most: int) -> list[int]:
     """The rows of the best designs that are not alike, the best first."""
     chosen: list[int] = []
     for k in np.argsort(loss, kind="stable"):
-        if len(chosen) < most and all(np.abs(points[k] - points[c]).max() >= APART for c in chosen):
+        if len(chosen) < most and not near(points[k], points[chosen]):
             chosen.append(int(k))
     return chosen
 

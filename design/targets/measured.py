@@ -99,10 +99,9 @@ class Measured(Target):
             raise tf.InputError(str(error)) from error
         if not self._warned and not self.extinct and self._is_reached_without_cells(state):
             object.__setattr__(self, "_warned", True)
-            warnings.warn(
+            checks.warn(
                 f"a colony without cells is as it is wanted ({self.describe()}), but counts as"
-                " failed: Measured(…, extinct=True) measures it as any other.",
-                stacklevel=2,
+                " failed: Measured(…, extinct=True) measures it as any other."
             )
 
     def _is_reached_without_cells(self, state: tf.State) -> bool:

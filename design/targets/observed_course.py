@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -160,10 +159,9 @@ class ObservedCourse(Observed):
                 " has several times. Take Observed.from_table(…, time=…)."
             )
         if 2 * len(each) > len(times):
-            warnings.warn(
+            checks.warn(
                 f"{given.source}, column {column!r}: {len(each)} times in {len(times)} rows. Cells"
-                " of one frame have the same time: round those that the instrument noted.",
-                stacklevel=3,
+                " of one frame have the same time: round those that the instrument noted."
             )
         frames = []
         for t in each:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -177,10 +176,9 @@ def _colonies(table: tables.Table, columns: Mapping[str, str]) -> np.ndarray | N
         named = any(isinstance(x, str) for x in given)
         odd = [x for x in dict.fromkeys(given) if isinstance(x, str) and not x.isdigit()]
         if odd and any(isinstance(x, str) and x.isdigit() for x in given):
-            warnings.warn(
+            checks.warn(
                 f"{table.source}, column {column!r}: {', '.join(odd[:8])} among numbers counts as"
-                " colonies of their own. Leave such rows out if they are none.",
-                stacklevel=5,
+                " colonies of their own. Leave such rows out if they are none."
             )
         return np.array([str(x) for x in given] if named else given)
     if COLONY in columns:
@@ -192,8 +190,7 @@ def warn_of_empty(results: tf.Results, table: Mapping[str, np.ndarray]) -> None:
     """Warn of colonies of a results file that have no cells in the table of a frame."""
     empty = sorted(set(results.colony_id.tolist()) - set(table["colony"].tolist()))
     if empty:
-        warnings.warn(
+        checks.warn(
             f"Observed.from_results: colonies {', '.join(map(str, empty[:8]))} of {results.path}"
-            " have no cells in this frame and are left out: what is observed is of the others.",
-            stacklevel=4,
+            " have no cells in this frame and are left out: what is observed is of the others."
         )

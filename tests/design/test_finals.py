@@ -11,9 +11,9 @@ import torch
 from searching import lit, mean
 
 import torchfilm as tf
-from design import Finals, Parameter, Search, Sobol, Study, Target
+from design import Finals, Measured, Parameter, Search, Sobol, Study, Target
 from design.entries import Entry
-from design.finals import CHECK_STREAM, FIRST_STREAM, HOLDS, LEAST, winner
+from design.finals import CHECK_STREAM, FIRST_STREAM, HOLDS, LEAST, is_certain, winner
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 
@@ -287,3 +287,45 @@ def test_few_seeds_are_no_band():
     made = search(finals=Finals(share=0.2, most=1))
     assert made.run(18, progress=False).band is None  # fewer than LEAST seeds fit
     assert len(made.run(40, progress=False).losses) >= LEAST
+
+
+def test_a_search_that_goes_on_leaves_new_designs_their_finals(tmp_path):
+    """The lowest losses of the first run are luck; a better design is found later. What earlier
+    finals took is not taken from the new ones."""
+    path = tmp_path / "s.h5"
+    search().run(100, study=path, progress=False)
+    before = Study.read(path)
+    assert before.tested == 0.0 and {e.after for e in before.finals} == {len(before.entries)}
+    made = search()
+    made.run(300, study=path, progress=False)
+    old = sum(e.colonies for e in before.finals)
+    new = [e for e in made.study.finals if e.after == len(made.study.entries)]
+    assert made.study.tested == old and made.study.colonies <= 300
+    reserved = made.finals.colonies(300)
+    known = {p.tobytes() for e in before.finals for p in e.points}
+    fresh = {p.tobytes() for e in new for p in e.points} - known
+    assert fresh and sum(e.colonies for e in new) > reserved / 2
+    assert made.study.searched <= 300 - reserved - old + 2 * 8
+
+
+def test_where_seeds_make_no_difference_finals_are_short():
+    """A fit of one cell without noise: two designs on two fresh seeds show it."""
+    rates = lambda u, s, p, cell: {"gfp": p.make - u.gfp}
+    one = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]])
+    scene = lambda make=1.0, noise=0.0: tf.Scene(
+        tf.Circuit(rates, species="gfp", make=make), dim=2, dt=0.1, founders=one
+    )
+    level = lambda state: state.groups.sum(state.gfp) + 0.0 * state.stream
+    options = {"wanted": {"gfp": 1.5}, "spread": {"gfp": 0.1}, "time": 1.0, "smooth": True}
+    room = [Parameter("make", 0.1, 10, log=True)]
+    made = Search(scene, room, Measured({"gfp": level}, **options), replicates=1)
+    best = made.run(200, progress=False)
+    assert is_certain(made.objective.task, made.study)
+    assert sum(e.colonies for e in made.study.finals) <= 2 * 2 + LEAST
+    assert made.study.searched > 200 - 2 * 2 - LEAST - 24 and best.loss < 1e-6
+    assert best.fresh is not None and len(best.losses) == LEAST
+    lucky = lambda state: state.groups.sum(state.gfp) + 1e-3 * (state.stream % 7)
+    other = Search(scene, room, Measured({"gfp": lucky}, **options), replicates=1)
+    other.run(200, progress=False)
+    assert not is_certain(other.objective.task, other.study)
+    assert sum(e.colonies for e in other.study.finals) > 30

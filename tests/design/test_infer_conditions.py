@@ -117,12 +117,12 @@ def test_a_colony_that_fails_under_one_condition_fails_its_design():
 @pytest.mark.skipif(find_spec("sbi") is None, reason='needs pip install -e ".[infer]"')
 def test_the_posterior_of_a_dose_response_covers_the_truth(data):
     found = infer(
-        sensor, K, data, simulations=200, dt=0.1, flows=1, epochs=80, samples=500, progress=False
-    )
+        sensor, K, data, simulations=200, rounds=2, dt=0.1, flows=1, epochs=80, samples=500,
+        progress=False,
+    )  # fmt: skip
     low, high = found.interval()["half"]
-    assert low < 1.0 < high and high / low < 2.0
+    assert low < 1.0 < high and high / low < 1.5
     assert "under each of 3 conditions at 2 h" in found.table() and not found.surprises
-    assert found.given(data).points.shape == (500, 1)
     with pytest.raises(tf.InputError, match="data of the same statistics"):
         found.given(data.parts[0])
 

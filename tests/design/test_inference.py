@@ -70,7 +70,8 @@ def test_simulations_resume(data, tmp_path, monkeypatch):
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
         assert alike(simulate_designs(task, 10, executor=pool), whole)
     with h5py.File(path) as file:
-        assert set(file) == {"points", "statistics", "cells", "names", "values"}
+        places = {"regions", "starts of regions"}
+        assert set(file) == {"points", "statistics", "cells", "names", "values"} | places
         assert file["values/rate"][0] == pytest.approx(task.space.values(whole.points[0])["rate"])
 
 
@@ -270,7 +271,7 @@ def test_without_sbi_the_error_names_the_extra(monkeypatch, data):
 
 @needs_sbi
 def test_a_poor_flow_is_learnt_again(monkeypatch):
-    """A flow that ignores the statistics is as wide as the bounds."""
+    """A flow that is far wider than what the regression leaves."""
     rng = np.random.default_rng(0)
     points = rng.random((400, 1))
     statistics = np.c_[points + 0.02 * rng.normal(size=(400, 1)), rng.normal(size=(400, 1))]
@@ -278,9 +279,7 @@ def test_a_poor_flow_is_learnt_again(monkeypatch):
 
     def learn(theta, x, seed, epochs):
         seeds.append(seed)
-        blind = seed in (1, 3)
-        return real(theta, torch.zeros_like(x) + 0.01 * torch.randn(x.shape) if blind else x, seed,
-                    epochs)  # fmt: skip
+        return _Flat() if seed in (1, 3) else real(theta, x, seed, epochs)
 
     monkeypatch.setattr(neural_posterior, "_learn_flow", learn)
     given = {"seed": 0, "epochs": 60}
@@ -297,7 +296,7 @@ def test_an_estimator_that_learns_nothing_is_warned_of(monkeypatch):
     rng = np.random.default_rng(0)
     points = rng.random((200, 1))
     monkeypatch.setattr(neural_posterior, "_learn_flow", lambda theta, x, seed, epochs: _Flat())
-    with pytest.warns(UserWarning, match="learnt less from the simulations than a straight line"):
+    with pytest.warns(UserWarning, match="learnt less from the simulations than a linear reg"):
         NeuralPosterior.learn(points, points + 0.001 * rng.random((200, 1)), seed=0, flows=2,
                               epochs=5)  # fmt: skip
 
@@ -306,7 +305,7 @@ class _Flat:
     """A wide normal density, whatever the statistics."""
 
     def log_prob(self, theta, condition):
-        return torch.distributions.Normal(0.0, 3.0).log_prob(theta).sum(-1)
+        return torch.distributions.Normal(0.0, 30.0).log_prob(theta).sum(-1)
 
 
 @needs_sbi
@@ -353,8 +352,8 @@ def test_colonies_that_stop_before_the_data_have_failed(data):
 
 
 @needs_sbi
-def test_few_simulations_of_many_statistics_are_not_compared_with_a_line():
-    """A line through 60 points of 40 numbers fits them far better than others."""
+def test_few_simulations_of_many_statistics_are_not_compared_with_a_regression():
+    """A regression of 60 points on 40 numbers fits them far better than others."""
     rng = np.random.default_rng(1)
     points = rng.random((60, 1))
     statistics = np.c_[points, rng.normal(size=(60, 39))]

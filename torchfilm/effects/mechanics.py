@@ -7,6 +7,7 @@ import copy
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from typing import Any, ClassVar
 
 import torch
@@ -35,6 +36,9 @@ from torchfilm.values import Rule, Value, checked, numbers, physical, quotient, 
 
 # The default length drag: free growth, but for bilateral contacts, which do not hold in it.
 LENGTH_DRAG = {"one-sided": 1e5, "bilateral": 10.0}
+# From this length drag on, pressure hardly slows growth, and the time of a step grows as the number
+# of cells to the power 1.65 (docs/performance.md); below, about in proportion to it.
+FREE, CROWDING = 1000.0, 0.65
 CONTACTS = ("one-sided", "bilateral")
 # Accuracy settings state a worst residual; one-sided solves, whose tolerance is the error of
 # forces, are about as accurate at so many times that.
@@ -113,6 +117,8 @@ class Mechanics(Effect):
         check_backend("Mechanics", self.backend)
         if self.length_drag is None:
             object.__setattr__(self, "length_drag", LENGTH_DRAG[self.contacts])
+        if isinstance(self.length_drag, Real) and self.length_drag >= FREE:
+            object.__setattr__(self, "crowding", CROWDING)
         if self.alpha is not None and self.stiffness is not None:
             raise checks.InputError(
                 "Mechanics got alpha and stiffness: α = 1/(stiffness·Δt), so give one of the two."

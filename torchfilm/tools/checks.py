@@ -19,6 +19,7 @@ from torch import Tensor
 from torchfilm.tools.one_per_colony import Value as Value
 from torchfilm.tools.warn_once import SMALL_SPECIES as SMALL_SPECIES  # public, for searches
 from torchfilm.tools.warn_once import once as once
+from torchfilm.tools.warn_once import warn as warn
 from torchfilm.tools.whole_files import write_whole as write_whole
 
 Number = float | int
@@ -67,9 +68,8 @@ def nearest(given: str, known: Iterable[str]) -> str | None:
 
 def suggestion(given: object, known: Iterable[object]) -> str:
     """'Did you mean …?' for a name that is like a known one, else ""."""
-    if not isinstance(given, str):
-        return ""
-    near = nearest(given, [k for k in known if isinstance(k, str)])
+    names = [k for k in known if isinstance(k, str)]
+    near = nearest(given, names) if isinstance(given, str) else None
     return f"Did you mean {near!r}?" if near else ""
 
 
