@@ -325,7 +325,10 @@ def _misses(target: Target, best: ReportedDesign) -> str:
     if not worst:
         return ""
     words = ", ".join(f"{n} by {apart[n]:.1f} spreads" for n in worst)
-    like = "colonies that grew as the observed ones did have a loss of about 1. "
+    like = (
+        "colonies that grew as the observed ones did have a loss of about 1 (up to 5 where one or"
+        " two were observed, which do not tell how much colonies differ). "
+    )
     return (
         f"{like if target.evidence else ''}The best design is off most in {words}. Search longer,"
         " free more parameters, or change the model."

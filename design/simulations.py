@@ -81,9 +81,15 @@ class Simulations:
         )
 
     def failures(self) -> list[tuple[str, int]]:
-        """The reasons of failures, without their times, and how often each came, most first."""
-        alike = (re.sub(r"^at \S+ h: | at \S+ h$", "", words) for words in self.reasons.values())
-        return Counter(alike).most_common()
+        """The reasons of failures, without their times, and how often each came, most first. Those
+        that differ in numbers alone are one, in the words of the first."""
+        firsts: dict[str, str] = {}
+        counts: Counter[str] = Counter()
+        for words in self.reasons.values():
+            untimed = re.sub(r"^at \S+ h: | at \S+ h$", "", words)
+            kind = re.sub(r"\d+(\.\d+)?(e[+-]?\d+)?", "#", untimed)
+            counts[firsts.setdefault(kind, untimed)] += 1
+        return counts.most_common()
 
 
 def observed_of(task: Task) -> Observed:

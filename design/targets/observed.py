@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 
 ENOUGH = 3  # colonies from which on the spread between them is measured
 FINEST = 0.01  # the least spread, relative to the greatest statistic of its group
-COUNT = 0.02  # the least spread of the logarithm of a number of cells
+# The least spread of the logarithm of a number of cells; and of the number itself, which is whole.
+COUNT, PART = 0.02, 0.5
 VARIED = 0.01  # the least spread of a coefficient of variation
 
 
@@ -61,7 +62,8 @@ class Observed(Target):
     number of cells has 1/√N, as if divisions were independent. This leaves out what all cells of a
     colony share. With 3 colonies or more, it is the standard deviation between them where that is
     greater, and for the number of cells in any case. Spreads are at least 1 % of the greatest
-    statistic of their kind.
+    statistic of their kind; that of the number of cells is at least 2 %, and half a cell. Of one or
+    two colonies the loss of a right model is up to 5.
     """
 
     pattern = False
@@ -407,7 +409,7 @@ def _observed(cells: SeenCells, plan: ColonyStatistics, time: float | None) -> O
         for names in plan.groups.values()
     ])  # fmt: skip
     if plan.names[0] == LOG_CELLS:
-        least[0] = COUNT
+        least[0] = max(COUNT, PART / float(cells.counts.double().mean()))
     alike = torch.tensor([VARIED if n.endswith("_cv") else 0.0 for n in plan.names])
     least = torch.maximum(least, alike.to(least))
     spread = torch.maximum(spread, least)
