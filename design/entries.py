@@ -21,7 +21,7 @@ class Entry:
     for them; copies: colonies that were grown for each loss: more than 1 for its derivatives, 0
     where it was known before; goals (n, G): the losses of several targets side by side, NaN for a
     design that failed; each_goals (n, R, G): those of each replicate. choosing: seconds that the
-    method took to propose them. after: of finals, the batches of the search before them.
+    method took to propose them.
     """
 
     points: np.ndarray
@@ -38,7 +38,6 @@ class Entry:
     goals: np.ndarray | None = None
     each_goals: np.ndarray | None = None
     choosing: float = 0.0
-    after: int = 0
 
     @property
     def replicates(self) -> int:

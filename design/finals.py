@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 from scipy.stats import t as student
 
+from design.entries import Entry
 from design.objective import Objective
 from design.parameters import Choice
 from design.pareto import nondominated, spread
@@ -25,11 +26,14 @@ from torchfilm import checks
 
 FIRST_STREAM = 1_000_000  # beyond the streams of searches and robustness checks
 CHECK_STREAM = 2_000_000  # of the check of the winner
+SOUND_STREAM = 3_000_000  # of what shows whether seeds matter
+STAGES = SOUND_STREAM, CHECK_STREAM, FIRST_STREAM
 CHECK = 1 / 3  # of the colonies of finals with several designs
 MOST_SHARE = 0.9  # of a budget
 LEAST = 4  # fresh seeds of a finalist
 ALIKE = 0.02  # designs that are nearer in every coordinate count as one
 SOUNDED = 2  # designs, and fresh seeds of each, that show whether seeds matter
+ALIKE_LOSSES = 1e-9  # losses that differ by less, relative to the greater, are one
 HOLDS = (8, 24)  # fresh seeds of a design that may hold the wanted loss: first, then in all
 TESTED = 3  # designs of a batch that may hold it
 BAND = 0.9  # probability of a band
@@ -123,7 +127,7 @@ def _fresh(
     losses = worst_of_sizes([_tested(study, point, size, first=first) for size in sizes])
     if len(losses) < LEAST:
         return None
-    rivals = {p.tobytes() for p in _known(study) if len(_tested(study, p, sizes[0])) >= LEAST}
+    rivals = {p.tobytes() for p in _known(study)}
     chosen = first == FIRST_STREAM and len(rivals) > 1
     return FreshLosses(losses, float(task.reduced(losses[None])[0]), _band(task, losses), chosen)
 
@@ -163,24 +167,31 @@ def _tested(
         getattr(e, name)[k]
         for e in study.finals
         if e.size == size and getattr(e, name) is not None
-        if (e.streams[0] >= CHECK_STREAM) == (first == CHECK_STREAM)
+        if _stage(e) == first
         for k in np.flatnonzero((e.points == point).all(1))
     ]
     return np.concatenate(found) if found else np.empty(0)
 
 
+def _stage(entry: Entry) -> int:
+    """To which part of the finals a batch belongs, by its first seed."""
+    return next(first for first in STAGES if entry.streams[0] >= first)
+
+
 def _known(study: Study) -> list[np.ndarray]:
     """The designs that were grown on fresh seeds, (D,) each."""
-    return list({p.tobytes(): p for e in study.finals for p in e.points}.values())
+    finals = [e for e in study.finals if _stage(e) != SOUND_STREAM]
+    return list({p.tobytes(): p for e in finals for p in e.points}.values())
 
 
 def is_certain(task: Task, study: Study) -> bool:
-    """Whether seeds make no difference to losses, as far as designs were grown on several: those
-    of one cell, say, whose circuit has no noise."""
-    each = [losses for e in study.finals for losses in e.losses]
-    sound = [losses for losses in each if not (losses == task.target.failed).any()]
-    alike = all(np.ptp(losses) <= 1e-9 * np.abs(losses).max() for losses in sound)
-    return alike and len({float(losses[0]) for losses in sound}) >= SOUNDED
+    """Whether seeds make no difference to losses: neither to those of designs that were sounded,
+    nor to those of any design that the search grew on several."""
+    sounded = [x for e in study.finals if _stage(e) == SOUND_STREAM for x in e.losses]
+    searched = [x for e in study.full() if e.replicates > 1 for x in e.losses]
+    sound = lambda each: [x for x in each if not (x == task.target.failed).any()]
+    alike = all(np.ptp(x) <= ALIKE_LOSSES * np.abs(x).max() for x in sound(sounded + searched))
+    return alike and len({float(x[0]) for x in sound(sounded)}) >= SOUNDED
 
 
 def _is_mean(task: Task) -> bool:
@@ -254,11 +265,17 @@ class FinalsRun:
                 wanted -= 1
             self._grow([best], wanted, CHECK_STREAM)
 
-    def sound(self) -> None:
-        """Grow the first designs on a few fresh seeds: where these make no difference, the finals
-        need hardly any colonies."""
-        if not self.study.finals and len(self.finals.sizes) == 1:
-            self._grow(self._finalists()[:SOUNDED], SOUNDED)
+    def sound(self) -> bool:
+        """Whether seeds make no difference, so that the finals need hardly any colonies: the best
+        designs so far are grown on a few fresh ones, where that may save some."""
+        saved = self.finals.colonies(self.budget) - self.finals.colonies(self.budget, certain=True)
+        best, done = (
+            self._finalists()[:SOUNDED],
+            any(_stage(e) == SOUND_STREAM for e in self.study.finals),
+        )
+        if not done and len(best) == SOUNDED and saved > SOUNDED**2 and len(self.finals.sizes) == 1:
+            self._grow(best, SOUNDED, SOUND_STREAM)
+        return is_certain(self.task, self.study)
 
     def holds(self, wanted: float) -> bool:
         """Whether one of the best designs, of all and of the last batch, holds a loss on fresh

@@ -14,7 +14,8 @@ import torch
 
 import torchfilm as tf
 from design.neural_posterior import NeuralPosterior, require_sbi
-from design.parameters import Choice, Parameter
+from design.options import Options
+from design.parameters import Choice, Parameter, Space
 from design.posterior import Posterior
 from design.prior import Prior
 from design.progress import advance, open_bar
@@ -94,7 +95,7 @@ def infer(
         fixed=fixed, seed=seed, dt=dt, dtype=dtype, device=device, replay=False,
     )  # fmt: skip
     known = Prior(task.space, prior)
-    estimation = _Estimation(seed, flows, epochs, progress, np.array(data.spread))
+    estimation = _Estimation(seed, flows, epochs, progress, data.spread, _options_in(task.space))
     found, estimator = _in_rounds(
         task, known, data, simulations, rounds, kept, executor, estimation
     )
@@ -113,6 +114,16 @@ def _check_counts(simulations: int, rounds: int, *, samples: int, flows: int, ep
     if simulations < LEAST * rounds:
         rule = f"at least {LEAST} for each of {rounds} rounds"
         raise checks.input_error("simulations", simulations, rule)
+
+
+def _options_in(space: Space) -> list[int | None]:
+    """The options of choices and whole numbers, or of choices alone where that makes too many
+    combinations to tell apart."""
+    each = list(space.levels)
+    if Options.of(each).places:
+        return each
+    of = zip(each, space.parameters, strict=True)
+    return [count if isinstance(p, Choice) else None for count, p in of]
 
 
 def _check_end(seen: float | None, cells: int | None, until: float | None) -> None:
@@ -134,7 +145,8 @@ class _Estimation:
     flows: int
     epochs: int
     progress: bool | None
-    unit: np.ndarray
+    unit: Sequence[float]
+    levels: list[int | None]
 
     def learn(self, found: Simulations, region: Region) -> NeuralPosterior:
         """The density of the parameters, given statistics, within a region."""
@@ -147,8 +159,9 @@ class _Estimation:
                     bar.set_postfix_str(f"learning flow {flow + 1} of {self.flows}")
 
             learnt = NeuralPosterior.learn(
-                found.points[rows], found.statistics[rows], unit=self.unit, region=region,
-                seed=self.seed, flows=self.flows, epochs=self.epochs, begun=begun,
+                found.points[rows], found.statistics[rows], unit=np.array(self.unit), region=region,
+                levels=self.levels, seed=self.seed, flows=self.flows, epochs=self.epochs,
+                begun=begun,
             )  # fmt: skip
             advance(bar, 1)
         return learnt
@@ -198,8 +211,11 @@ def _simulate(
         found = simulate(count, regions=regions, seen=seen)
     sound = int(found.within(regions[-1]).sum())
     if sound < LEAST:
+        tried = int(regions[-1].holds(found.points).sum())
+        why = "".join(
+            f"; the most frequent reason of failure: {w}" for w, _ in found.failures()[:1]
+        )
         raise tf.InputError(
-            f"{sound} of {count - regions[-1].start} simulations succeeded, and {LEAST} are needed;"
-            f" the most frequent reason of failure: {found.failures()[0][0]}"
+            f"{sound} of {tried} simulations succeeded, and {LEAST} are needed{why}"
         )
     return found

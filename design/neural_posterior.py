@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 import torchfilm as tf
+from design.options import Classifier, Options
 from design.quiet import ALONE, alone_and_quiet
 from design.region import Region
 
@@ -86,15 +87,31 @@ class Flow:
     density: Any
     regression: Regression
 
-    def sample(self, count: int, x: Tensor) -> Tensor:
-        """Samples for each row of x (m, K'): (count, m, D)."""
-        drawn = self.density.sample((count,), condition=x.float()).double()
-        return self.regression.theta(drawn, x)
+    def sample(self, classes: Tensor, x: Tensor, options: Options) -> Tensor:
+        """A sample for each class (m, count) of the options, given each row of x (m, K'): (m,
+        count, D)."""
+        given = _with_options(x.repeat_interleave(classes.shape[1], 0), classes.flatten(), options)
+        drawn = self.density.sample((1,), condition=given.float())[0].double()
+        return self.regression.theta(drawn, given).unflatten(0, classes.shape)
 
-    def log_density(self, theta: Tensor, x: Tensor) -> Tensor:
-        """Of theta (n, m, D) for each row of x (m, K'): (n, m)."""
-        left = self.regression.residuals(theta, x).float()
-        return self.density.log_prob(left, condition=x.float()).double() - self.regression.log_scale
+    def log_density(self, theta: Tensor, classes: Tensor, x: Tensor, options: Options) -> Tensor:
+        """Of theta (m, n, D) and classes (m, n), for each row of x (m, K'): (m, n)."""
+        given = _with_options(x.repeat_interleave(classes.shape[1], 0), classes.flatten(), options)
+        return self.of_rows(theta.flatten(0, 1), given).unflatten(0, classes.shape)
+
+    def of_rows(self, theta: Tensor, given: Tensor) -> Tensor:
+        """The logarithm of the density of theta (n, D), given statistics and options, (n,)."""
+        left = self.regression.residuals(theta, given).float()
+        found = self.density.log_prob(left[None], condition=given.float())[0].double()
+        return found - self.regression.log_scale
+
+
+def _with_options(x: Tensor, classes: Tensor, options: Options) -> Tensor:
+    """Statistics (n, K') with a column for each class but the first."""
+    if not options.places:
+        return x
+    hot = nn.functional.one_hot(classes, options.classes)[:, 1:]
+    return torch.cat([x, hot.to(x)], 1)
 
 
 def _with_one(x: Tensor) -> Tensor:
@@ -105,6 +122,7 @@ def _with_one(x: Tensor) -> Tensor:
 class NeuralPosterior:
     """The density of parameters, given statistics, as the mean of some normalising flows.
 
+    options: of choices; classifier: how likely they are; flows are given the options, too.
     flows: of ln(u/(1 − u)), where u in [0, 1] are the coordinates of parameters as shares of
     `region`, within which all samples lie. Over the whole bounds the relation is far from linear,
     and they have no regression; in a part of them they have. unit: (K,) of the statistics that vary
@@ -119,6 +137,8 @@ class NeuralPosterior:
     scale: Tensor
     used: np.ndarray
     region: Region
+    options: Options
+    classifier: Classifier | None
 
     @staticmethod
     @tf.one_torch_thread()  # flows are so small that threads take longer to meet than to compute
@@ -128,13 +148,15 @@ class NeuralPosterior:
         *,
         unit: np.ndarray | float = 1.0,
         region: Region | None = None,
+        levels: Sequence[int | None] = (),
         seed: int,
         flows: int,
         epochs: int,
         begun: Callable[[int], None] = lambda _: None,
     ) -> NeuralPosterior:
         """Learn from simulations: points (n, D) within the region, by default all in [0, 1],
-        statistics (n, K), all finite. unit: of each statistic, about its error.
+        statistics (n, K), all finite. unit: of each statistic, about its error. levels: the
+        options of each dimension, None of one that has none.
 
         The method is that of Papamakarios and Murray (NeurIPS 2016) with masked autoregressive
         flows, by the package sbi; the mean of several flows is less sure of itself than each
@@ -150,21 +172,34 @@ class NeuralPosterior:
         spread, level = seen.std(0), np.abs(seen).max(0)
         used = spread > CONSTANT * np.maximum(level, CONSTANT)
         if not used.any():
+            of = "" if region is None or region.is_whole else " of a round"
+            hint = "Widen their bounds, or observe something else." if not of else "Give rounds=1."
             raise tf.InputError(
-                "all simulations have the same statistics: the parameters do not change what was"
-                " observed. Widen their bounds, or observe something else."
+                f"all simulations{of} have the same statistics: the parameters do not change what"
+                f" was observed. {hint}"
             )
         centre, scale = (torch.tensor(v[used]) for v in (seen.mean(0), spread))
         region = region or Region.whole(points.shape[1])
-        theta = _logit(torch.as_tensor(region.widen(points)))
+        options = Options.of(levels)
+        rest = options.rest(points.shape[1])
         x = _scaled(torch.as_tensor(seen[:, used]), centre, scale)
-        line, least = Regression.none(theta, x), -math.inf
-        if len(x) >= ENOUGH * x.shape[1]:
-            known = Regression.of(theta, x)
-            line, least = line if region.is_whole else known, known.fit
+        classes = torch.as_tensor(options.of_points(points))
+        theta = _logit(torch.as_tensor(region.widen(points)[:, rest]))
         with ALONE, torch.random.fork_rng(devices=[]):
-            learnt = _learn_flows(theta, x, line, least, seed, flows, epochs, begun)
-        return NeuralPosterior(learnt, unit, centre, scale, used, region)
+            classifier: Classifier | None = None
+            learnt: tuple[Flow, ...] = ()
+            if options.places:
+                classifier = Classifier.learn(
+                    x, classes, options.classes, seed=seed, networks=flows, epochs=epochs
+                )
+            if rest:
+                given = _with_options(x, classes, options)
+                line, least = Regression.none(theta, given), -math.inf
+                if len(x) >= ENOUGH * given.shape[1]:
+                    known = Regression.of(theta, given)
+                    line, least = line if region.is_whole else known, known.fit
+                learnt = _learn_flows(theta, given, line, least, seed, flows, epochs, begun)
+        return NeuralPosterior(learnt, unit, centre, scale, used, region, options, classifier)
 
     def _inputs(self, statistics: np.ndarray) -> Tensor:
         seen = torch.as_tensor(_compressed(statistics, self.unit)[:, self.used])
@@ -177,17 +212,33 @@ class NeuralPosterior:
         in [0, 1]. Every flow gives an equal share of them."""
         x = self._inputs(statistics)
         rows = max(1, SAMPLES_AT_ONCE // count)
-        shares = [count * (k + 1) // len(self.flows) - count * k // len(self.flows)
-                  for k in range(len(self.flows))]  # fmt: skip
         with ALONE, torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            parts = [
-                torch.cat([flow.sample(share, some)
-                           for flow, share in zip(self.flows, shares, strict=True) if share])
-                for some in x.split(rows)
-            ]  # fmt: skip
-        found = torch.sigmoid(torch.cat(parts, 1)).transpose(0, 1).contiguous()
-        return self.region.narrow(found.numpy())
+            parts = [self._draw(some, count) for some in x.split(rows)]
+        return np.concatenate(parts)
+
+    def _draw(self, x: Tensor, count: int) -> np.ndarray:
+        """Coordinates (m, count, D) for inputs x (m, K')."""
+        out = np.empty((len(x), count, len(self.region.low)))
+        classes = torch.zeros(len(x), count, dtype=torch.int64)
+        if self.classifier is not None:
+            shares = self.classifier.log_shares(x).exp()
+            classes = torch.multinomial(shares, count, replacement=True)
+            within = torch.rand(*classes.shape, len(self.options.places), dtype=torch.float64)
+            found = self.options.coordinates(classes.numpy(), within.numpy())
+            out[..., list(self.options.places)] = found
+        if self.flows:
+            ends = [count * k // len(self.flows) for k in range(len(self.flows) + 1)]
+            theta = torch.cat([
+                flow.sample(classes[:, first:last], x, self.options)
+                for flow, first, last in zip(self.flows, ends, ends[1:], strict=False)
+                if last > first
+            ], 1)  # fmt: skip
+            whole = np.zeros_like(out)
+            rest = self.options.rest(out.shape[-1])
+            whole[..., rest] = torch.sigmoid(theta).numpy()
+            out[..., rest] = self.region.narrow(whole)[..., rest]
+        return out
 
     @torch.no_grad()
     @tf.one_torch_thread()
@@ -195,13 +246,22 @@ class NeuralPosterior:
         """The logarithm of the density of coordinates, (m, n), for points (m, n, D) and one row of
         statistics each, (m, K)."""
         x = self._inputs(statistics)
-        shares = torch.as_tensor(self.region.widen(points))
-        u = shares.transpose(0, 1).clamp(EDGE, 1.0 - EDGE)
-        each = [flow.log_density(_logit(u), x) for flow in self.flows]
-        mixed = torch.logsumexp(torch.stack(each), 0) - math.log(len(each))
-        # from ln(u/(1 − u)) to u, and from this to coordinates
+        classes = torch.as_tensor(self.options.of_points(points))
+        found = torch.zeros(points.shape[:-1], dtype=torch.float64)
+        if self.classifier is not None:
+            # evenly within each level
+            found = self.classifier.log_shares(x).gather(1, classes) + math.log(
+                self.options.classes
+            )
+        if self.flows:
+            rest = self.options.rest(points.shape[-1])
+            u = torch.as_tensor(self.region.widen(points)[..., rest]).clamp(EDGE, 1.0 - EDGE)
+            each = [flow.log_density(_logit(u), classes, x, self.options) for flow in self.flows]
+            found = found + torch.logsumexp(torch.stack(each), 0) - math.log(len(each))
+            # from ln(u/(1 − u)) to u, and from this to coordinates
+            found = found - (u * (1.0 - u)).log().sum(-1)
         width = float(np.log(self.region.high - self.region.low).sum())
-        return (mixed - (u * (1.0 - u)).log().sum(-1)).transpose(0, 1).numpy() - width
+        return np.where(self.region.holds(points), found.numpy() - width, -np.inf)
 
 
 def _compressed(statistics: np.ndarray, unit: np.ndarray) -> np.ndarray:
@@ -271,7 +331,7 @@ def _learn_flows(
             begun(k)
             made = Flow(_learn_flow(left, x.float(), seed + attempt * flows + k, epochs), line)
             with torch.no_grad():
-                fit = float(made.log_density(theta.unsqueeze(0), x).mean())
+                fit = float(made.of_rows(theta, x).mean())
             if found[k][1] is None or fit > found[k][0]:
                 found[k] = fit if math.isfinite(fit) else -math.inf, made
     best = max(fit for fit, _ in found)

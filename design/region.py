@@ -9,6 +9,7 @@ import numpy as np
 
 BEYOND = 0.01  # share of the samples on either side of a region, before its margin
 MARGIN = 0.25  # of the width between these, on either side
+LEAST = 1e-3  # width: where the data lie beyond the bounds, all samples lie at one
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +33,9 @@ class Region:
         return bool((self.low == 0.0).all() and (self.high == 1.0).all())
 
     def holds(self, points: np.ndarray) -> np.ndarray:
-        """Which designs (n, D) lie within, (n,) bool."""
+        """Which designs (…, D) lie within, (…) bool."""
         within = (points >= self.low) & (points <= self.high)
-        return np.asarray(within.all(1))
+        return np.asarray(within.all(-1))
 
     def around(self, samples: np.ndarray, dimensions: Sequence[int], start: int) -> Region:
         """The part of this region that holds nearly all samples (n, D), with a margin. Only the
@@ -42,9 +43,14 @@ class Region:
         low, high = self.low.copy(), self.high.copy()
         for k in dimensions:
             first, last = np.quantile(samples[:, k], [BEYOND, 1.0 - BEYOND])
-            margin = MARGIN * (last - first)
-            low[k] = max(low[k], first - margin)
-            high[k] = min(high[k], last + margin)
+            margin = max(MARGIN * (last - first), 0.5 * (LEAST - (last - first)))
+            # not beyond the region before, from which it may keep only LEAST
+            least = min(LEAST, high[k] - low[k])
+            middle = np.clip(0.5 * (first + last), low[k] + 0.5 * least, high[k] - 0.5 * least)
+            low[k], high[k] = (
+                max(low[k], min(first - margin, middle - 0.5 * least)),
+                min(high[k], max(last + margin, middle + 0.5 * least)),
+            )
         return Region(low, high, start)
 
     def widen(self, points: np.ndarray) -> np.ndarray:

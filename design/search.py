@@ -14,7 +14,7 @@ import numpy as np
 
 import torchfilm as tf
 from design.best import Best
-from design.finals import MOST_SHARE, Finals, FinalsRun, fresh_losses, is_certain, winner
+from design.finals import MOST_SHARE, Finals, FinalsRun, fresh_losses, winner
 from design.front import Front, front_of
 from design.growing import FinishedColonies
 from design.known import KnownDesigns, Start, known_designs
@@ -227,24 +227,16 @@ class Search(TaskOptions):
             proposal = proposal or Proposal.of_number(
                 len(self.study.entries), method, task, self._known
             )
-            if finals is not None and self.study.entries and self._may_be_certain:
-                finals.sound()
-            limit = max(colonies - self._reserved(colonies), task.colonies_each)  # one design
-            # earlier finals leave the new ones their share
-            room = limit - self.study.searched - self.study.tested
-            room = min(room, colonies - self.study.colonies)
-            part = proposal.part(self.objective, room)
+            part = proposal.part(self.objective, self._room(colonies, False))
+            if part is None and finals is not None and self._may_be_certain and finals.sound():
+                part = proposal.part(self.objective, self._room(colonies, True))
             if part is None:
                 return False
             streams = task.streams(None)[: part.replicates]
             found = self.objective.evaluate(
-                part.points,
-                streams=streams,
-                size=part.size,
-                executor=executor,
-                work_items=work_items,
-                slopes=part.slopes,
-            )
+                part.points, streams=streams, size=part.size, executor=executor,
+                work_items=work_items, slopes=part.slopes,
+            )  # fmt: skip
             proposal.take(found.entry(streams), self.study)
             within_reach = within_reach or check_within_reach(self.objective, self.study)
             remark_on_batch(task, self.study, part.size, found.loss)
@@ -255,16 +247,22 @@ class Search(TaskOptions):
             _show(bar, self.study)
         return True
 
-    def _reserved(self, colonies: int) -> float:
-        """How many of the colonies are for the finals."""
-        task = self.objective.task
-        each, certain = colonies / task.conditions, is_certain(task, self.study)
-        return task.conditions * self.finals.colonies(each, certain) if self.finals else 0.0
+    def _reserved(self, colonies: int, certain: bool = False) -> float:
+        """How many of the colonies are for the finals. certain: seeds make no difference."""
+        count = self.objective.task.conditions
+        return count * self.finals.colonies(colonies / count, certain) if self.finals else 0.0
+
+    def _room(self, colonies: int, certain: bool) -> float:
+        """How many colonies the search may still grow, one design at least. Earlier finals leave
+        the new ones their share."""
+        limit = max(colonies - self._reserved(colonies, certain), self.objective.task.colonies_each)
+        return limit - self.study.colonies
 
     @property
     def _may_be_certain(self) -> bool:
         """Whether seeds may make no difference, as in fits of circuits without noise."""
-        return self.objective.least_squares and not self.objective.task.target.pattern
+        task = self.objective.task
+        return self.objective.least_squares and not task.target.pattern and not task.goals
 
     def _reached(self, stop_at: float | None, finals: FinalsRun | None) -> bool:
         """Whether the best design so far has the wanted loss, and holds it where it is tested."""

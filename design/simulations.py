@@ -282,16 +282,16 @@ def _write(
     return mark
 
 
-def _read(path: Path | None, task: Task, about: Mapping[str, Any]) -> Simulations:
-    """What a file holds; nothing where there is none. Raises InputError for the file of another
-    task and for one that cannot be read."""
+def _read(path: Path | None, task: Task, wanted: Mapping[str, Any]) -> Simulations:
+    """What a file holds; nothing where there is none. wanted: what they should be `about`. Raises
+    InputError for the file of another task and for one that cannot be read."""
     names = observed_of(task).plan.names
     regions: tuple[Region, ...] = (Region.whole(task.space.size),)
     if path is None or not path.exists():
         nothing = np.empty((0, task.space.size)), np.empty((0, len(names))), np.empty(0)
         return Simulations(*nothing, {}, regions)
     with reading(path, FORMAT, VERSION, "file of simulations") as file:
-        kept, mine = json.loads(file.attrs["about"]), dict(about)
+        kept, mine = json.loads(file.attrs["about"]), dict(wanted)
         reasons = {int(k): words for k, words in json.loads(file.attrs["reasons"]).items()}
         points, cells = file["points"][...], np.full(len(file["points"]), np.nan)
         if "cells" in file:  # older files have none

@@ -6,7 +6,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from dataclasses import replace as with_fields
 from pathlib import Path
 from typing import Any
 
@@ -49,11 +48,6 @@ class Study:
     def colonies(self) -> float:
         """Colonies simulated so far, with those of the finals."""
         return self.searched + sum(e.colonies for e in self.finals)
-
-    @property
-    def tested(self) -> float:
-        """Colonies of finals after which the search has gone on."""
-        return sum(e.colonies for e in self.finals if e.after < len(self.entries))
 
     @property
     def seconds(self) -> float:
@@ -213,7 +207,7 @@ class Study:
     def add_final(self, entry: Entry) -> None:
         """Add a batch of the finals, and write the file. Raises SimulationError where that
         fails."""
-        self.finals.append(with_fields(entry, after=len(self.entries)))
+        self.finals.append(entry)
         self._write()
 
     def _write(self) -> None:

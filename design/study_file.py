@@ -33,7 +33,7 @@ from torchfilm import checks
 
 FORMAT, VERSION = "torchfilm study", 3
 # Of a batch, by the same names in the file and in an Entry.
-BATCH = ("size", "replicates", "seconds", "copies", "choosing", "after")
+BATCH = ("size", "replicates", "seconds", "copies", "choosing")
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,11 +124,8 @@ def _read_entries(group: h5py.Group, streams: tuple[int, ...] | None = None) -> 
     batches.setdefault("copies", np.ones_like(batches["rows"]))  # version 1 has none
     batches.setdefault("first_stream", np.zeros_like(batches["rows"]))  # nor has version 2
     batches.setdefault("choosing", np.zeros(len(batches["rows"])))  # nor have early files of 3
-    batches.setdefault("after", np.zeros_like(batches["rows"]))
     columns_of = (batches[n].tolist() for n in ("rows", "first_stream", *BATCH))
-    for rows, first, size, replicates, seconds, copies, choosing, after in zip(
-        *columns_of, strict=True
-    ):
+    for rows, first, size, replicates, seconds, copies, choosing in zip(*columns_of, strict=True):
         mine = slice(at, at + rows)
         reasons = {
             (r, int(k)): words
@@ -153,7 +150,6 @@ def _read_entries(group: h5py.Group, streams: tuple[int, ...] | None = None) -> 
                     designs["each_goals"][mine, :replicates] if "each_goals" in designs else None
                 ),
                 choosing=choosing,
-                after=after,
             )
         )
         at += rows

@@ -57,6 +57,7 @@ def test_contacts_of_large_colonies_in_free_growth_cost_more_a_cell(drag, power)
     state = model.start()
     costs = CostProbe(model, blocks, state, state, "", True, 1.0).fit("seconds")
     contacts, growth = costs["mechanics"], costs["growth"]
+    assert contacts.crowd == state.cells
     assert contacts.of(1, 3) == pytest.approx(3e-5)
     for cost, wanted in ((contacts, power), (growth, 1.0)):
         ratio = cost.of(1e5, 2) / cost.of(1e4, 2)

@@ -103,6 +103,22 @@ def test_the_correlation_is_the_sum_over_all_pairs(periodic, edges):
     assert found[0].tolist() == pytest.approx(wanted, rel=1e-9)
 
 
+def test_a_bin_without_pairs_is_none():
+    place = np.stack([np.arange(200.0), np.zeros(200)], 1)
+    y = np.random.default_rng(0).normal(size=200)
+    found = tf.measure.correlation(lawn(y, place), "y", [0.0, 0.5, 1.5])[0]
+    assert bool(found[0].isnan()) and bool(found[1].isfinite())
+
+
+def test_a_cell_just_below_a_face_is_within():
+    below = np.nextafter(1.7, -np.inf)
+    place = np.array([[below, 0.0], [-3.2, 0.0], [0.0, 0.0]])
+    found = tf.measure.correlation(
+        lawn(np.array([1.0, 2.0, -3.0]), place, {"x": (-3.3, 1.7)}), "y", [0.0, 0.2]
+    )
+    assert float(found) == pytest.approx(2.0 / (14 / 3))
+
+
 def test_colonies_do_not_see_one_another():
     rng = np.random.default_rng(1)
     place, owner = rng.uniform(0, 10, (90, 2)), np.repeat([0, 1, 2], 30)

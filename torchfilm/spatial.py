@@ -76,11 +76,14 @@ def pair_correlation(state: State, value: Tensor, edges: Sequence[float]) -> Ten
     limits = np.nextafter(np.array(edges), -np.inf)
     counts = state.counts.tolist()
     space, box = state.space, None
-    where = state.position if space is None else space.inside(state.position)
+    where = state.position.double()
     if space is not None:
-        box = np.array(space.period)  # 0 along an axis without faces
-        where = where - where.new_tensor(space.low)
-    parts = zip(value.cpu().split(counts), where.double().cpu().split(counts), strict=True)
+        period = where.new_tensor(space.period)  # 0 along an axis without faces
+        where = space.inside(where) - where.new_tensor(space.low)
+        # the difference may be rounded up to a whole period
+        where = torch.where((period > 0) & (where >= period), torch.zeros_like(where), where)
+        box = period.cpu().numpy()
+    parts = zip(value.cpu().split(counts), where.cpu().split(counts), strict=True)
     for colony, (own, place) in enumerate(parts):
         apart = (own - own.mean()).numpy()
         if not len(apart) or not apart.any():
@@ -91,6 +94,7 @@ def pair_correlation(state: State, value: Tensor, edges: Sequence[float]) -> Ten
         if edges[0] == 0.0:  # pairs at one place, but for each cell with itself
             sums[1] += sums[0] - np.square(apart).sum()
             pairs[1] += pairs[0] - len(apart)
-        with np.errstate(invalid="ignore"):
-            found[colony] = sums[1:] / pairs[1:] / np.square(apart).mean()
+        with np.errstate(invalid="ignore", divide="ignore"):
+            means = np.where(pairs[1:] > 0, sums[1:] / pairs[1:], np.nan)
+        found[colony] = means / np.square(apart).mean()
     return value.new_tensor(found)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -99,7 +99,8 @@ def choose(
         )
     descents, fits = _descents(cloud, about), _fits(cloud, data, BATCH)
     sparse = _fits(CMAES(population=SPARSE, sigma=WIDTH), data, SPARSE)[:1]
-    known = (few, race, *descents, *fits, *sparse, *((learnt, modelled) if botorch else ()))
+    older = [_once(fit) for fit in (*fits, *sparse)]
+    known = (few, race, *descents, *fits, *sparse, *((learnt, modelled) if botorch else ()), *older)
     every = Chosen(Exhaustive(), f"{different:g} different designs: the budget grows each")
     if begun := [x for x in (*known, every) if x.describe() == before]:
         return Chosen(begun[0].method, "the study began with it")
@@ -154,6 +155,11 @@ def _descents(cloud: CMAES, about: str) -> tuple[Chosen, ...]:
         )
         for starts in range(1, MOST_STARTS + 1)
     )
+
+
+def _once(fit: Chosen) -> Chosen:
+    """Descents as studies have them that began before they were done again."""
+    return replace(fit, method=replace(fit.method, again=False))
 
 
 def _fits(cloud: CMAES, data: str, after: int) -> tuple[Chosen, ...]:

@@ -22,9 +22,9 @@ class Polish(AskTell):
 
     inner: the method that searches first; None is Racing(). after: designs that it grows before, in
     units of full colonies with all replicates; one at least is grown to full size. starts: the best
-    of them, no two alike, from which `Local` descends side by side; then from the best with each
-    combination of few options. Where all descents have ended, `inner` goes on; with `again`, there
-    are further descents after as many designs, from the best that are unlike all starts before.
+    of them, no two alike, from which `Local` descends side by side. Where all descents have ended,
+    `inner` goes on. again: descend also from the best with each combination of few options, and
+    again after as many further designs, from the best that are unlike all starts before.
 
     CMA-ES and racing find the valley; its floor is a matter of the last digits of several
     parameters at once, and a slope knows all of these. Derivatives cost colonies (see `Local`), so
@@ -97,7 +97,7 @@ class Polish(AskTell):
         levels = self._started().levels
         options = [k for k, count in enumerate(levels) if count is not None]
         count = math.prod(levels[k] or 1 for k in options)
-        if options and count <= OPTIONS:
+        if self.again and options and count <= OPTIONS:
             # a descent keeps its options: the best design may have the wrong ones
             sizes = np.array([levels[k] for k in options])
             taken = np.minimum(points[:, options] * sizes, sizes - 1).astype(int)

@@ -315,19 +315,19 @@ def test_auto_descends_in_fits_of_few_designs():
 
 
 def test_descents_begin_again_from_designs_unlike_all_starts():
-    method = begun(Polish(inner=Sobol(batch=8), after=8, starts=2, again=True), ROOM)
-    history = run(method, 60)
+    method = begun(Polish(inner=Sobol(batch=8), after=16, starts=2, again=True), ROOM)
+    history = run(method, 80)
     descending = [len(batch.points) < 8 for batch, _ in history]
-    assert len(history[0][0].points) == 8 and descending[1]
-    begins = [k for k in range(1, 60) if descending[k] and not descending[k - 1]]
+    assert descending[:3] == [False, False, True]
+    begins = [k for k in range(1, len(history)) if descending[k] and not descending[k - 1]]
     assert len(begins) >= 2
     starts = np.concatenate([history[k][0].points for k in begins])
     apart = np.abs(starts[:, None] - starts).max(2) + np.eye(len(starts))
     assert apart.min() >= 0.05
-    # eight more designs each time
+    # after as many more designs each time
     for one, other in itertools.pairwise(begins):
-        assert sum(not d for d in descending[one:other]) == 1
-    once = run(begun(Polish(inner=Sobol(batch=8), after=8, starts=2), ROOM), 60)
+        assert sum(not d for d in descending[one:other]) == 2
+    once = run(begun(Polish(inner=Sobol(batch=8), after=16, starts=2), ROOM), 80)
     assert sum(len(b.points) == 8 for b, _ in once) > sum(not d for d in descending)
 
 
@@ -342,7 +342,8 @@ def test_each_combination_of_few_options_has_a_descent():
         return residuals, np.vstack([slope * np.eye(2, 3), np.zeros((1, 3))])
 
     room = Room((None, None, 2))
-    method, found = begun(Polish(inner=Sobol(batch=8), after=8, starts=1), room), []
+    made = Polish(inner=Sobol(batch=8), after=8, starts=1, again=True)
+    method, found = begun(made, room), []
     for _ in range(40):
         batch = method.ask()
         found.append((batch, answer(method, batch, function)))
@@ -350,7 +351,8 @@ def test_each_combination_of_few_options_has_a_descent():
     assert (first.points[:, 2] < 0.5).all()
     assert min(loss.min() for _, loss in found) < 1e-12
     # with more combinations than a few, descents begin at the best alone
-    many = begun(Polish(inner=Sobol(batch=8), after=8, starts=1), Room((None, None, 7)))
+    made = Polish(inner=Sobol(batch=8), after=8, starts=1, again=True)
+    many = begun(made, Room((None, None, 7)))
     for _ in range(2):
         batch = many.ask()
         answer(many, batch, function)

@@ -13,10 +13,11 @@ import scipy.stats
 import torchfilm as tf
 from design import Choice, Measured, Parameter, infer
 from design.inference import LEAST
-from design.neural_posterior import NeuralPosterior
+from design.neural_posterior import NeuralPosterior, _compressed
 from design.parameters import Space
 from design.prior import Prior
 from design.region import BEYOND, MARGIN, Region
+from design.region import LEAST as LEAST_WIDTH
 from design.simulations import _points
 
 needs_sbi = pytest.mark.skipif(find_spec("sbi") is None, reason='needs pip install -e ".[infer]"')
@@ -50,6 +51,25 @@ def test_a_region_holds_the_samples_and_a_margin():
     # never beyond the region before
     wide = found.around(np.random.default_rng(0).random((500, 2)), [0, 1], 9)
     assert (wide.low >= found.low).all() and (wide.high <= found.high).all()
+
+
+@pytest.mark.parametrize("at", [0.0, 1.0])
+def test_a_region_has_a_width(at):
+    """Data beyond what a bound gives: all samples lie there."""
+    found = Region.whole(1).around(np.full((100, 1), at), [0], 5)
+    assert found.high - found.low == pytest.approx([LEAST_WIDTH])
+    assert found.holds(np.array([[at]])).all()
+    again = found.around(np.full((100, 1), at), [0], 9)
+    assert np.array_equal([again.low, again.high], [found.low, found.high])
+    inside = Region.whole(1).around(np.full((100, 1), 0.3), [0], 5)
+    assert [*inside.low, *inside.high] == pytest.approx([0.2995, 0.3005])
+
+
+@needs_sbi
+def test_data_beyond_the_bounds_end_at_a_bound():
+    """gfp = exp(−loss) is 0.99 at most within the bounds."""
+    found = infer(washout, LOSS, seen(1.5), rounds=2, replicates=1, **OPTIONS)
+    assert found.interval()["loss"][1] < 0.1 and found.surprises
 
 
 def test_designs_of_a_region_follow_the_prior_within_it():
@@ -89,6 +109,8 @@ def test_the_density_is_that_of_its_samples(narrow):
         width = float(region.high[0] - region.low[0])
         assert density.mean() * width == pytest.approx(1.0, abs=0.01)
         drawn = learnt.sample(row, 4000, seed=1)[0]
+        beyond = region.high + 0.01 if narrow else np.array([1.01])
+        assert learnt.log_density(beyond[None, None], row)[0, 0] == -np.inf
         assert region.holds(drawn).all()
         mean = (density * grid[:, 0]).sum() / density.sum()
         assert drawn.mean() == pytest.approx(mean, abs=0.002)
@@ -165,3 +187,9 @@ def test_each_round_needs_simulations():
         infer(washout, LOSS, seen(), simulations=120, rounds=3)
     with pytest.raises(tf.InputError, match="rounds = 0"):
         infer(washout, LOSS, seen(), rounds=0)
+
+
+def test_statistics_that_vary_far_more_than_their_errors_are_compressed():
+    x = np.array([[-40.0, 3.0], [0.1, 3.0]])
+    found = _compressed(x, np.array([0.1, np.inf]))
+    assert found == pytest.approx(np.array([[np.arcsinh(-400.0), 3.0], [np.arcsinh(1.0), 3.0]]))
