@@ -388,6 +388,20 @@ def test_strains_and_heterozygosity():
     rings = tf.measure.heterozygosity(state, edges=[0.0, 2.0, 5.0, 10.0])
     assert rings[0, [0, 2]].tolist() == [0.0, 0.5] and bool(rings[0, 1].isnan())
     assert rings[1, :2].tolist() == [0.0, 0.0] and bool(rings[2].isnan().all())
+    # along an axis, and a coordinate of one's own: the same as of the cells in each bin
+    x = state.position[:, 0]
+    edges = [float(x.min()) - 1.0, float(x.median()) + 1e-3, float(x.max()) + 1.0]
+    found = tf.measure.heterozygosity(state, edges=torch.tensor(edges), along="x")
+    assert torch.equal(found.nan_to_num(-1), tf.measure.heterozygosity(
+        state, edges=edges, along=x).nan_to_num(-1))  # fmt: skip
+    for colony in range(state.colonies):
+        for k in range(2):
+            kept = (x >= edges[k]) & (x < edges[k + 1]) & (state.colony == colony)
+            shares = state.cell_type[kept].bincount().double() / kept.sum()
+            wanted = 1 - shares.square().sum() if kept.any() else torch.tensor(math.nan)
+            assert float(found[colony, k]) == pytest.approx(float(wanted), nan_ok=True)
+    with pytest.raises(tf.InputError, match=r"heterozygosity\(along\) = 'r'"):
+        tf.measure.heterozygosity(state, edges=edges, along="r")
     alone = tf.measure.heterozygosity(state.select([1]), edges=[0.0, 2.0, 5.0, 10.0])
     assert torch.equal(alone[0, :2], rings[1, :2])
 

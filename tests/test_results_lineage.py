@@ -294,6 +294,21 @@ def test_founders_and_clones(tmp_path):
         assert found == set(mine).union(*(tree.ancestors(c, colony) for c in mine))
         assert text.count(";") == len(set(roots))
         assert len(tree.to_newick(colony)) > len(text)
+        # as the frames have them; at a birth there are daughters, and no mother
+        with tf.Results(path) as results:
+            for frame in (0, len(results) // 2, len(results) - 1):
+                table = results.table(frame)
+                there = table["cell"][table["colony"] == colony].tolist()
+                roots = [([c, *tree.ancestors(c, colony)])[-1] for c in there]
+                at = tree.clone_sizes(colony, time=results.times[frame])
+                assert at == {f: roots.count(f) for f in range(4)}
+        for row in np.flatnonzero(tree.colony == colony):
+            cell = int(tree.cell[row])
+            below = {cell, *tree.descendants(cell, colony)}
+            assert tree.living_descendants[row] == len(below & set(mine))
+    for time in (-1.0, 99.0):
+        with pytest.raises(tf.InputError, match=r"clone_sizes\(time\) = "):
+            tree.clone_sizes(0, time=time)
     assert tree.to_pandas()["founder"].tolist() == tree.founder.tolist()
     with pytest.raises(tf.InputError, match="one cell or more"):
         tree.common_ancestor([], 0)

@@ -306,29 +306,33 @@ def strains(
 @of_a_state
 @torch.no_grad()
 def heterozygosity(
-    state: State, name: str = "cell_type", *, edges: row_checks.Numbers | None = None
+    state: State,
+    name: str = "cell_type",
+    *,
+    edges: row_checks.Numbers | None = None,
+    along: str | Tensor = "radius",
 ) -> Tensor:
     """The probability that two cells drawn at random, with replacement, are of different kinds,
     1 − Σ p², of each colony: (B,) float64. 0 where one kind is fixed; NaN without cells.
 
-    name: as for `strains`. edges: of rings around the colony's centre, µm, ascending, R + 1 of
-    them: then it is that of each ring, (B, R), NaN in a ring without cells, as in range expansions
-    (Hallatschek et al., PNAS 104, 19926, 2007)."""
+    name: as for `strains`. edges: of bins, µm, ascending, R + 1 of them: then it is that of each
+    bin, (B, R), NaN in one without cells (as in Hallatschek et al., PNAS 104, 19926, 2007). along:
+    as for `profile`, such as "y" for a front that runs along y, or (N,) distances from where the
+    colony began."""
     kind = kinds_of("heterozygosity", state, name)
     rings, ring = 1, torch.zeros_like(state.colony)
     if edges is not None:
-        limits = checked_edges("heterozygosity", edges, 0.0)
-        apart = state.position - colony_centre(state).index_select(0, state.colony)
-        radius = safe_norm(apart[:, :2].double().T)
+        limits = checked_edges("heterozygosity", edges)
+        place = _place("heterozygosity", state, along).contiguous()
         rings = len(limits) - 1
-        ring = torch.bucketize(radius, radius.new_tensor(limits), right=True) - 1
+        ring = torch.bucketize(place, place.new_tensor(limits), right=True) - 1
     inside = (ring >= 0) & (ring < rings)
-    place = (state.colony * rings + ring)[inside]
+    bins = (state.colony * rings + ring)[inside]
     count = lambda x: torch.bincount(x, minlength=state.colonies * rings).double()
-    total, kept = count(place), kind[inside]
+    total, kept = count(bins), kind[inside]
     squares = torch.zeros_like(total)
     for k in kept.unique().tolist():
-        squares += (count(place[kept == k]) / total) ** 2
+        squares += (count(bins[kept == k]) / total) ** 2
     found = torch.where(total > 0, 1.0 - squares, torch.nan).reshape(state.colonies, rings)
     return found[:, 0] if edges is None else found
 
@@ -341,18 +345,21 @@ def profile(
     float64; NaN in a bin without cells.
 
     name: a field of the cells, a signal at them as "out.NAME", or numbers, (N,). edges: of the
-    bins, K + 1 of them, µm, ascending. along: "x", "y", "z", "radius" from the colony's centre in
-    the x–y plane, "top" as `below_top` has it, or a coordinate of your own, (N,)."""
+    bins, K + 1 of them, µm, ascending. along: "x", "y", "z", "radius" from the colony's centre (of
+    volume) in the x–y plane, "top" as `below_top` has it, or a coordinate of your own, (N,)."""
     value, limits = quantity("profile", state, name), checked_edges("profile", edges)
+    return binned_mean(state.groups, value, _place("profile", state, along), limits)
+
+
+def _place(measure: str, state: State, along: str | Tensor) -> Tensor:
+    """The coordinate of each cell, (N,) µm, as `profile` has it."""
     if isinstance(along, Tensor):
-        return binned_mean(state.groups, value, quantity("profile", state, along), limits)
-    checks.choice("profile(along)", along, (*"xyz"[: state.dim], "radius", "top"))
-    if along == "top":
-        return binned_mean(state.groups, value, below_top(state), limits)
+        return quantity(measure, state, along)
+    checks.choice(f"{measure}(along)", along, (*"xyz"[: state.dim], "radius", "top"))
     if along != "radius":
-        return binned_mean(state.groups, value, state.position[:, "xyz".index(along)], limits)
+        return below_top(state) if along == "top" else state.position[:, "xyz".index(along)]
     apart = state.position - colony_centre(state).index_select(0, state.colony)
-    return binned_mean(state.groups, value, safe_norm(apart[:, :2].double().T), limits)
+    return safe_norm(apart[:, :2].double().T)
 
 
 @of_a_state

@@ -187,12 +187,29 @@ class Lineage:
         found = np.concatenate(both)
         return found[(found >= 0).all(1)]
 
-    def clone_sizes(self, colony: int | None = None) -> dict[int, int]:
+    def clone_sizes(
+        self, colony: int | None = None, *, time: float | None = None
+    ) -> dict[int, int]:
         """How many living cells descend from each founder of a colony, by its uid; 0 for a line
-        that has died out."""
+        that has died out. time: h, by default that of the last frame."""
+        when = self.now
+        if time is not None:
+            when = checks.number("clone_sizes(time)", time, least=self.begin, most=self.now)
         mine = self.colony == self.colony_of_run(colony)
-        alive = self.founder[mine & (self.fate == "alive")]
+        # a mother ends when her daughters are born; what has an unknown end is gone
+        there = (self.born <= when) & ((self.fate == "alive") | (self.ended > when))
+        alive = self.founder[mine & there]
         return {int(f): int((alive == f).sum()) for f in np.unique(self.founder[mine])}
+
+    @cached_property
+    def living_descendants(self) -> np.ndarray:
+        """How many living cells descend from each cell, itself among them, (N,) in the rows of the
+        table: of mutations at a cell's birth, this is how many cells carry them."""
+        found = (self.fate == "alive").astype(np.int64)
+        for generation in range(int(self.generation.max(initial=0)), 0, -1):
+            rows = np.flatnonzero(self.generation == generation)
+            np.add.at(found, self._mothers[rows], found[rows])
+        return found
 
     def common_ancestor(self, cells: Sequence[int], colony: int | None = None) -> int | None:
         """The youngest cell from which all of these descend, or that is one of them and the
