@@ -18,7 +18,7 @@ from design.finals import MOST_SHARE, Finals, FinalsRun, fresh_losses, winner
 from design.front import Front, front_of
 from design.growing import FinishedColonies
 from design.known import KnownDesigns, Start, known_designs
-from design.methods import METHODS, Chosen, Method, choose, designs_of, method_of
+from design.methods import METHODS, Chosen, Exhaustive, Method, choose, designs_of, method_of
 from design.objective import Objective
 from design.progress import advance, finish, open_bar
 from design.proposal import Proposal, repeat_study
@@ -352,7 +352,8 @@ class Search(TaskOptions):
             math.inf if task.space.digest else designs_of(task.space),
             (colonies - self._reserved(colonies)) / task.colonies_each,
         )
-        why = "" if task.tried.stochastic else self.objective.why_no_squares
+        told = task.tried.stochastic or isinstance(chosen.method, Exhaustive) or before
+        why = "" if told else self.objective.why_no_squares
         return replace(chosen, why=f"{chosen.why}; no least squares: {why}") if why else chosen
 
     def _open_study(self, path: str | Path | None, method: str) -> Study:
