@@ -34,7 +34,7 @@ from torchfilm import checks
 
 NONE = cast(Target, None)  # the target where `targets` are given
 REDUCE = ("mean", "worst")
-TOO_MANY = 1e8  # cells of a colony
+TOO_MANY, NEVER = 1e8, 1e30  # cells of a colony: of which is warned, and which none can have
 SHORTEST = 1000  # parts of the first time among which a step is looked for
 # what studies say of the course of a step: losses of another one do not compare
 ORDER = "division at the end"
@@ -143,10 +143,11 @@ class Task(TaskOptions):
         self._set(fixed=fixed, until=until, dt=dt, family=family, tried=tried)
         if until is not None and self.cells is None and tried.growth * until > math.log(TOO_MANY):
             power = tried.growth * until / math.log(10.0)
-            checks.warn(
-                f"until = {until:g} h: at {tried.growth:.3g}/h, a cell becomes 10^{power:.0f} cells"
-                " by then. Are times in hours, and rates in 1/h?"
-            )
+            words = f"at {tried.growth:.3g}/h, a cell becomes 10^{power:.0f} cells by then"
+            hint = "Are times in hours, and rates in 1/h?"
+            if tried.growth * until > math.log(NEVER):
+                raise tf.InputError(f"until = {until:g} h is not allowed: {words}. {hint}")
+            checks.warn(f"until = {until:g} h: {words}. {hint}")
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():

@@ -182,12 +182,18 @@ def test_minutes_for_hours(more):
         circuit = tf.Circuit(rates, species="gfp", start=start)
         return tf.Scene(tf.Growth(rate=0.8), tf.Division(length=4.0), circuit, *more, dim=2, dt=0.1)
 
-    make = lambda: Task(growing, SPACE[:1], course((60.0, 120.0), (1.0, 2.0)), replicates=1)
+    def make(last):
+        return Task(growing, SPACE[:1], course((last / 2, last), (1.0, 2.0)), replicates=1)
+
     if more:
-        make()
+        make(120.0)
         return
-    with pytest.warns(UserWarning, match=r"until = 120 h.*10\^42 cells.*Are times in hours"):
-        make()
+    with pytest.raises(tf.InputError, match=r"until = 120 h.*10\^42 cells.*Are times in hours"):
+        make(120.0)
+    with pytest.warns(UserWarning, match=r"until = 40 h.*10\^14 cells.*Are times in hours") as seen:
+        make(40.0)
+    assert seen[0].filename == __file__
+    make(20.0)
 
 
 def test_a_check_grows_data_to_no_other_size():
