@@ -29,6 +29,7 @@ class Intervals:
     parameters: those without levels, at `values`; whole numbers and choices are held. covariance:
     (D, D) of these, of ln of those that are searched by logarithm; inf where the data tell nothing.
     readings: how many there are. loss: of the fit; about 1 − D/readings where the model is right.
+    above: by how much it is above the minimum near it, as the derivatives have it.
     """
 
     parameters: tuple[Parameter, ...]
@@ -36,6 +37,7 @@ class Intervals:
     covariance: np.ndarray
     readings: int
     loss: float
+    above: float = 0.0
 
     @property
     def correlation(self) -> np.ndarray:
@@ -83,6 +85,11 @@ class Intervals:
             f" spreads about {expected:.2f}"
             + (": it is more, so that these intervals are too narrow" if far else "")
         )
+        if self.readings * self.above > 1.0:  # by about a standard error of one parameter
+            lines.append(
+                f"the search has not come to the bottom: the loss is some {self.above:.2g} above"
+                " the minimum near it. Search longer."
+            )
         return tf.displays.Text("\n".join(lines))
 
     def __repr__(self) -> str:
@@ -125,7 +132,18 @@ def intervals_of(
     return Intervals(
         known, tuple(float(values[p.name]) for p in known),
         _inverse(information) * np.outer(size, size), readings, loss,
+        _above(point[space.moving], found.gradient[0][space.moving], 2 * information / readings),
     )  # fmt: skip
+
+
+def _above(point: np.ndarray, gradient: np.ndarray, curvature: np.ndarray) -> float:
+    """By how much the loss is above the minimum of its quadratic, ½ gᵀ H⁻¹ g, in the coordinates
+    that no bound stops."""
+    free = ~(((point <= 0) & (gradient > 0)) | ((point >= 1) & (gradient < 0)))
+    told, directions = np.linalg.eigh(curvature[np.ix_(free, free)])
+    along = directions.T @ gradient[free]
+    known = told > UNTOLD * max(told.max(initial=0.0), 1e-300)
+    return 0.5 * float((along[known] ** 2 / told[known]).sum())
 
 
 def _inverse(information: np.ndarray) -> np.ndarray:

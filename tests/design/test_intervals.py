@@ -9,6 +9,7 @@ from scipy.optimize import curve_fit
 
 import torchfilm as tf
 from design import Conditions, Intervals, Measured, ObservedCourse, OnFraction, Parameter, Search
+from design.intervals import intervals_of
 
 ONE = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]])
 TIMES = np.arange(1, 9) * 0.5
@@ -52,6 +53,21 @@ def fitted(target, *names, **options):
     space = [SPACE[n] for n in names]
     search = Search(washout, space, target, replicates=2, dtype=torch.float64, **options)
     return search.run(colonies=300, progress=False)
+
+
+def test_a_fit_above_its_minimum_is_told():
+    """½ gᵀ H⁻¹ g is by how much the loss is above that of the least squares."""
+    target = course()
+    search = Search(washout, [SPACE["start"], SPACE["loss"]], target, dtype=torch.float64)
+    best = search.run(colonies=600, progress=False)
+    assert best.intervals().above < 1e-6
+    assert "has not come to the bottom" not in best.intervals().table()
+    values = {"start": best.values["start"] * 1.05, "loss": best.values["loss"]}
+    point = search.objective.task.space.point(values)
+    loss = float(search.objective.evaluate(point[None]).loss[0])
+    off = intervals_of(search.objective, point, values, loss)
+    assert off.above == pytest.approx(loss - best.loss, rel=0.1)
+    assert f"some {off.above:.2g} above the minimum near it. Search longer." in off.table()
 
 
 @pytest.mark.parametrize("conditions", [False, True])
