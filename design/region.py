@@ -58,5 +58,6 @@ class Region:
         return (points - self.low) / (self.high - self.low)
 
     def narrow(self, shares: np.ndarray) -> np.ndarray:
-        """The inverse of `widen`."""
-        return self.low + (self.high - self.low) * shares
+        """The inverse of `widen`, within the region."""
+        # rounding may lead beyond
+        return np.clip(self.low + (self.high - self.low) * shares, self.low, self.high)

