@@ -164,8 +164,8 @@ def pressure(state: State, scene: Scene) -> Tensor:
 @of_a_state
 def growth_rates(state: State, earlier: State) -> Tensor:
     """How fast each cell has grown since an earlier state of the same run, (N,) 1/h: the change of
-    ln(volume) over time. NaN for cells that were born since. Pressure makes it less than the field
-    `growth_rate`, which is the rate without it."""
+    ln(volume) over time. NaN for cells born since, which are those that grow: take states a few
+    steps apart, or the mean is too low. Pressure makes it less than the field `growth_rate`."""
     known, before = _known_before("growth_rates", state, earlier)
     now, before = state.volume.double()[known], earlier.volume.double()[before]
     rates = torch.full_like(state.volume.detach().double(), torch.nan)
