@@ -348,9 +348,21 @@ def test_values_of_ones_own_colour_the_cells(tmp_path):
     assert "other" in legend(chosen) and "my level" not in legend(chosen)
 
 
+def test_colours_of_ones_own():
+    """Three values are the colour itself, without a legend."""
+    *_, state = tf.simulate(tf.scenes.microcolony(), cells=2)
+    picture = tf.show(state, values={"clone": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])})
+    faces = [c.get_facecolor() for a in picture.figure.axes for c in a.collections]
+    drawn = {tuple(np.round(x[:3], 3)) for each in faces for x in each}
+    assert {(1.0, 0.0, 0.0), (0.0, 0.0, 1.0)} <= drawn
+    assert not any(a.get_title() == "clone" for a in picture.figure.axes)
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [
+        ({"values": {"a": [[0.0, 0.0, 2.0]] * 2}}, r"values\['a'\] = '0 to 2'.*red, green"),
+        ({"values": {"a": [[0.0, 0.5]] * 2}}, r"values\['a'\].*or three for each, its colour"),
         ({"values": [1.0, 2.0]}, r"values = \[1\.0, 2\.0\].*by name"),
         ({"values": {"a": [1.0]}}, r"values\['a'\].*2 numbers, one a cell"),
         ({"values": {"a": ["x", "y"]}}, r"values\['a'\].*2 numbers"),

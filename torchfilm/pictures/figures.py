@@ -61,8 +61,8 @@ def show(
     highest.
 
     values: quantities of your own of a state, by name, one number for each cell: `values={"real
-    growth (1/h)": tf.measure.growth_rates(state, earlier)}`. The first colours the cells, unless
-    `colour` says otherwise.
+    growth (1/h)": tf.measure.growth_rates(state, earlier)}`; or three, its red, green and blue. The
+    first colours the cells, unless `colour` says otherwise.
 
     limits: the range of colours by name of a drawn quantity, such as {"yfp": (0, 2)}. A signal with
     the name of a quantity of the cells is "out.NAME". The default is the range of all that is drawn
@@ -151,9 +151,14 @@ def _with(values: Mapping[str, Any] | None, frame: Frame) -> Frame:
     count, more = len(frame.cells["colony"]), {}
     for name, given in (values or {}).items():
         array = np.asarray(given.detach().cpu() if isinstance(given, Tensor) else given)
-        if array.shape != (count,) or array.dtype.kind not in "fiub":
+        colours = array.shape == (count, 3) and count != 0
+        if not (array.shape == (count,) or colours) or array.dtype.kind not in "fiub":
             shown = f"{array.dtype} of shape {array.shape}"
-            raise checks.input_error(f"values[{name!r}]", shown, f"{count} numbers, one a cell")
+            rule = f"{count} numbers, one a cell, or three for each, its colour"
+            raise checks.input_error(f"values[{name!r}]", shown, rule)
+        if colours and not ((array >= 0) & (array <= 1)).all():
+            shown = f"{array.min():g} to {array.max():g}"
+            raise checks.input_error(f"values[{name!r}]", shown, "red, green and blue from 0 to 1")
         if name in frame.cells:
             raise checks.input_error("values", name, "other names than the cells have already")
         more[name] = array
