@@ -118,7 +118,7 @@ def test_a_prediction_is_a_band():
     assert len(figure.axes) == 2 and len(figure.axes[0].collections) >= 2
     assert "of a right model" not in shown.table()
     far = Prediction(data, np.zeros((3, 1)), np.stack([values - 1, values, values + 1]))
-    assert "give infer more simulations" in far.table()
+    assert "give infer rounds=2 or more simulations" in far.table()
 
 
 def test_lone_readings_and_several_inducers_are_seen():
