@@ -48,7 +48,8 @@ def draw_corner(
                 shares = np.full(len(before), len(x) / len(before))
                 drawn = dict(histtype="step", color="0.3", lw=1.0)
                 ax.hist(before[:, column], edges[column], weights=shares, **drawn)
-            ax.axvspan(*np.quantile(x, INTERVAL), color="C0", alpha=0.15, lw=0)
+            if not hasattr(space.parameters[row], "options"):  # options have no order
+                ax.axvspan(*np.quantile(x, INTERVAL), color="C0", alpha=0.15, lw=0)
         else:
             ax.hist2d(x, y, (edges[column], edges[row]), cmap="Blues")
         if truth is not None:
