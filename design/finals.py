@@ -269,10 +269,8 @@ class FinalsRun:
         """Whether seeds make no difference, so that the finals need hardly any colonies: the best
         designs so far are grown on a few fresh ones, where that may save some."""
         saved = self.finals.colonies(self.budget) - self.finals.colonies(self.budget, certain=True)
-        best, done = (
-            self._finalists()[:SOUNDED],
-            any(_stage(e) == SOUND_STREAM for e in self.study.finals),
-        )
+        done = any(_stage(e) == SOUND_STREAM for e in self.study.finals)
+        best = self._finalists()[:SOUNDED]
         if not done and len(best) == SOUNDED and saved > SOUNDED**2 and len(self.finals.sizes) == 1:
             self._grow(best, SOUNDED, SOUND_STREAM)
         return is_certain(self.task, self.study)

@@ -43,14 +43,12 @@ class Region:
         low, high = self.low.copy(), self.high.copy()
         for k in dimensions:
             first, last = np.quantile(samples[:, k], [BEYOND, 1.0 - BEYOND])
-            margin = max(MARGIN * (last - first), 0.5 * (LEAST - (last - first)))
+            margin = MARGIN * (last - first)
             # not beyond the region before, from which it may keep only LEAST
             least = min(LEAST, high[k] - low[k])
             middle = np.clip(0.5 * (first + last), low[k] + 0.5 * least, high[k] - 0.5 * least)
-            low[k], high[k] = (
-                max(low[k], min(first - margin, middle - 0.5 * least)),
-                min(high[k], max(last + margin, middle + 0.5 * least)),
-            )
+            low[k] = max(low[k], min(first - margin, middle - 0.5 * least))
+            high[k] = min(high[k], max(last + margin, middle + 0.5 * least))
         return Region(low, high, start)
 
     def widen(self, points: np.ndarray) -> np.ndarray:
