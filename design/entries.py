@@ -21,7 +21,8 @@ class Entry:
     for them; copies: colonies that were grown for each loss: more than 1 for its derivatives, 0
     where it was known before; goals (n, G): the losses of several targets side by side, NaN for a
     design that failed; each_goals (n, R, G): those of each replicate. choosing: seconds that the
-    method took to propose them.
+    method took to propose them. residuals (n, K): where the method asked for them, NaN for a design
+    that failed; None where all did.
     """
 
     points: np.ndarray
@@ -38,6 +39,7 @@ class Entry:
     goals: np.ndarray | None = None
     each_goals: np.ndarray | None = None
     choosing: float = 0.0
+    residuals: np.ndarray | None = None
 
     @property
     def replicates(self) -> int:
@@ -65,4 +67,17 @@ class Entry:
             goals=None if self.goals is None else join("goals"),
             each_goals=None if self.each_goals is None else join("each_goals"),
             slopes=None if self.slopes is None else joined([self.slopes, other.slopes]),
+            residuals=joined_residuals([(e.residuals, e.loss.shape) for e in (self, other)]),
         )
+
+
+def joined_residuals(
+    parts: Sequence[tuple[np.ndarray | None, tuple[int, ...]]],
+) -> np.ndarray | None:
+    """The residuals of several groups of designs one after the other, from those of each and the
+    shape of its losses: NaN where all of a group failed; None where all did."""
+    known = next((x for x, _ in parts if x is not None), None)
+    if known is None:
+        return None
+    fill = lambda shape: np.full((*shape, known.shape[-1]), np.nan)
+    return np.concatenate([fill(shape) if x is None else x for x, shape in parts])

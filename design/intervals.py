@@ -13,7 +13,7 @@ import numpy as np
 import torchfilm as tf
 from design.objective import Objective
 from design.parameters import Parameter, Value
-from design.targets.observed_conditions import data_of
+from design.targets.observed_conditions import data_of, standard_errors
 from torchfilm import checks
 
 UNTOLD = 1e-12  # of the greatest information along a direction; with less nothing is told of it
@@ -24,7 +24,9 @@ TOGETHER = 0.9  # a correlation from which tables say that two parameters are no
 class Intervals:
     """Intervals around a best fit, as least squares have them: where the readings have independent
     normal errors with their spreads as standard deviations, and the fit is nearly linear within
-    them (Seber and Wild, Nonlinear Regression, 1989, chapter 5).
+    them (Seber and Wild, Nonlinear Regression, 1989, chapter 5). Of colonies that were observed,
+    the spread is that of one, and the error of their mean less by the root of their number, of the
+    fewest under any condition; the luck of the simulated ones is left aside.
 
     parameters: those without levels, at `values`; whole numbers and choices are held. covariance:
     (D, D) of these, of ln of those that are searched by logarithm; inf where the data tell nothing.
@@ -113,7 +115,8 @@ def intervals_of(
 ) -> Intervals:
     """See `Best.intervals`. point: (D,) coordinates of the best fit; values, loss: of it."""
     task, space = objective.task, objective.task.space
-    readings = sum(len(part.values) for part in data_of(task.target))
+    data = data_of(task.target)
+    readings = sum(len(part.values) for part in data)
     if not objective.least_squares:
         raise checks.InputError(
             "intervals are from exact derivatives by the parameters, and here there are none:"
@@ -122,7 +125,9 @@ def intervals_of(
         )
     found = objective.evaluate(point[None], slopes=True).slopes
     assert found is not None
-    information = 0.5 * readings * found.curvature[0][np.ix_(space.moving, space.moving)]
+    curvature = found.curvature[0][np.ix_(space.moving, space.moving)]
+    fewest = min(float((part.spread / standard_errors(part)).min()) for part in data) ** 2
+    information = 0.5 * readings * fewest * curvature
     if not np.isfinite(information).all():
         raise checks.InputError("the best design has failed, and has no derivatives.")
     parameters = [space.parameters[k] for k in space.moving]
@@ -132,7 +137,7 @@ def intervals_of(
     return Intervals(
         known, tuple(float(values[p.name]) for p in known),
         _inverse(information) * np.outer(size, size), readings, loss,
-        _above(point[space.moving], found.gradient[0][space.moving], 2 * information / readings),
+        _above(point[space.moving], found.gradient[0][space.moving], curvature),
     )  # fmt: skip
 
 

@@ -29,7 +29,8 @@ class Evaluation:
     cells (n, R), of each colony at its end; reasons, by (row, replicate), why a colony failed;
     size: share of the full size; why_regrown: the reason why colonies did not follow recorded
     growth, or ""; seconds; slopes: of the n designs, where they were asked for; copies: colonies
-    that were grown for each loss (n, R); goals (n, G), each_goals (n, R, G): as `Entry` has them.
+    that were grown for each loss (n, R); goals (n, G), each_goals (n, R, G), residuals (n, K): as
+    `Entry` has them.
     """
 
     points: np.ndarray
@@ -45,6 +46,7 @@ class Evaluation:
     copies: int = 1
     goals: np.ndarray | None = None
     each_goals: np.ndarray | None = None
+    residuals: np.ndarray | None = None
 
     def entry(self, streams: tuple[int, ...], size: float | None = None) -> Entry:
         """For a study. streams: that were evaluated; size: share of the full size of the search,
@@ -63,6 +65,7 @@ class Evaluation:
             copies=self.copies,
             goals=self.goals,
             each_goals=self.each_goals,
+            residuals=self.residuals,
         )
 
 
@@ -86,6 +89,7 @@ class Objective(metaclass=checks.KnownKeywords):
         executor: Executor | None = None,
         work_items: int = 1,
         slopes: bool = False,
+        residuals: bool = False,
     ) -> Evaluation:
         """Grow and score designs, (n, D) coordinates in [0, 1]. All replicates of all designs share
         as few batches as fit into memory.
@@ -93,10 +97,11 @@ class Objective(metaclass=checks.KnownKeywords):
         streams: of random numbers, one for each replicate; by default 0 … replicates − 1. size:
         share of `cells` and `until`, for a cheap first look. slopes: also derivatives by the
         parameters without levels: exact where `why_differences` is "", else from differences.
-        executor: of the `concurrent.futures` kind, for other processes or machines. work_items: the
-        least number of parts for it. This process runs what the executor loses, and warns. The
-        losses are the same to the bit however the designs are divided, on machines of the same
-        kind. Raises InputError for points, streams or a size that are not allowed.
+        residuals: also those of a `comparable` target. executor: of the `concurrent.futures` kind,
+        for other processes or machines. work_items: the least number of parts for it. This process
+        runs what the executor loses, and warns. The losses are the same to the bit however the
+        designs are divided, on machines of the same kind. Raises InputError for points, streams or
+        a size that are not allowed, and for residuals of a target that has none to compare.
         """
         begun, task = time.perf_counter(), self.task
         try:
@@ -113,7 +118,10 @@ class Objective(metaclass=checks.KnownKeywords):
                 "points", points.shape, f"(n, {task.space.size}) coordinates in [0, 1]"
             )
         checks.number("size", size, above=0.0, most=1.0)
-        chosen, run = task.streams(streams), (size, executor, work_items)
+        if residuals and not task.target.comparable:
+            rule = "False: this target has none that compare from colony to colony"
+            raise checks.input_error("residuals", residuals, rule)
+        chosen, run = task.streams(streams), (size, executor, work_items, residuals)
         if not slopes:
             found = self._grow(points, None, chosen, *run)
         elif self.why_differences:
@@ -163,10 +171,11 @@ class Objective(metaclass=checks.KnownKeywords):
         size: float,
         executor: Executor | None,
         work_items: int,
+        residuals: bool,
     ) -> Evaluation:
         task, count = self.task, len(streams)
         values = [task.space.values(point) for point in points]
-        items = cut_work_items(task, values, count, size, work_items, tangents)
+        items = cut_work_items(task, values, count, size, work_items, tangents, residuals)
         results = (
             ((item, run_work_item(task, item, streams, size)) for item in items)
             if executor is None
@@ -178,8 +187,13 @@ class Objective(metaclass=checks.KnownKeywords):
         reasons: dict[tuple[int, int], str] = {}
         why_regrown = ""
         goals = np.full((len(points), count, task.goals), np.nan)
+        apart: np.ndarray | None = None
         for item, found in results:
             rows = list(item.rows)
+            if found.residuals is not None:
+                if apart is None:
+                    apart = np.full((*losses.shape, found.residuals.shape[2]), np.nan)
+                apart[rows] = found.residuals
             if found.goals is not None:
                 goals[rows] = found.goals
             losses[rows], cells[rows] = found.losses, found.cells
@@ -187,11 +201,13 @@ class Objective(metaclass=checks.KnownKeywords):
             why_regrown = why_regrown or found.why_regrown
             if found.slopes is not None:
                 gathered.put([row * count + k for row in rows for k in range(count)], found.slopes)
-        slopes = None if tangents is None else gathered.reduced(task.shares(losses))
+        shares = task.shares(losses)
+        slopes = None if tangents is None else gathered.reduced(shares)
+        mean = None if apart is None else (shares[:, :, None] * apart).sum(1)
         copies = task.conditions * (1 if tangents is None else len(tangents[0]))
         return Evaluation(
             points, values, losses, task.reduced(losses), cells, reasons, size, why_regrown, 0.0,
-            slopes, copies, task.reduced_goals(goals), goals if task.goals else None,
+            slopes, copies, task.reduced_goals(goals), goals if task.goals else None, mean,
         )  # fmt: skip
 
     def _differences(self, points: np.ndarray, streams: tuple[int, ...], *run: Any) -> Evaluation:
@@ -212,6 +228,7 @@ class Objective(metaclass=checks.KnownKeywords):
             copies=each * found.copies,
             goals=None if found.goals is None else found.goals[first],
             each_goals=None if found.each_goals is None else found.each_goals[first],
+            residuals=None if found.residuals is None else found.residuals[first],
             reasons={(r // each, k): w for (r, k), w in found.reasons.items() if not r % each},
         )  # fmt: skip
 

@@ -16,7 +16,7 @@ from torchfilm import checks
 # the classes that a file may name; those of users are code, and no data
 READY: tuple[type[Any], ...] = tuple(getattr(targets, name) for name in targets.__all__)
 KINDS = {kind.__name__: kind for kind in (Parameter, Choice, ColonyStatistics, *READY)}
-KIND = "kind"
+KIND, PAIRS = "kind", "pairs"
 
 
 class NotPlain(TypeError):
@@ -33,7 +33,10 @@ def to_data(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [to_data(entry) for entry in value]
     if isinstance(value, Mapping):
-        return {name: to_data(entry) for name, entry in value.items()}
+        if all(isinstance(name, str) for name in value):
+            return {name: to_data(entry) for name, entry in value.items()}
+        # JSON has texts for names, and these are numbers, such as cell types
+        return {PAIRS: [[to_data(name), to_data(entry)] for name, entry in value.items()]}
     if KINDS.get(type(value).__name__) is not type(value) or not dataclasses.is_dataclass(value):
         raise NotPlain(type(value).__name__)
     own = {f.name: to_data(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
@@ -48,6 +51,8 @@ def from_data(data: Any) -> Any:
     if not isinstance(data, Mapping):
         return data
     found = {name: from_data(entry) for name, entry in data.items()}
+    if set(found) == {PAIRS}:
+        return dict(found[PAIRS])
     if KIND not in found:
         return found
     kind = found.pop(KIND)

@@ -19,7 +19,7 @@ from design.simulations import Simulations, random_points, shown_values, simulat
 from design.targets.conditions import Conditions
 from design.targets.measured import Measured, extinct_words
 from design.targets.observed import Observed
-from design.targets.observed_conditions import averaged, cells_each, checked_data
+from design.targets.observed_conditions import averaged, cells_each, checked_data, standard_errors
 from design.targets.statistics import LOG_CELLS
 from design.task import Task
 from torchfilm import checks
@@ -132,11 +132,11 @@ class Posterior:
         """Statistics of the data that hardly any simulation reaches. Where there are some, no
         parameters within the bounds grow such colonies, and the samples mean little."""
         statistics = self.simulations.statistics[self.simulations.sound]
+        errors = standard_errors(self.observed)
         out = []
         for k, name in enumerate(self.observed.plan.names):
             value, column = self.observed.values[k], statistics[:, k]
-            # as far as a spread counts as reached
-            slack = 0.5 * self.observed.spread[k]
+            slack = 0.5 * errors[k]  # as far as a standard error counts as reached
             share = min((column <= value + slack).mean(), (column >= value - slack).mean())
             if share < BEYOND:
                 out.append(
@@ -230,12 +230,13 @@ class Posterior:
         """Simulation-based calibration (Talts et al., arXiv 1804.06788): grow colonies of hidden,
         random parameters, and see how often the posteriors of their statistics cover these. It
         costs `truths` simulations and no learning. Of a posterior that was learnt in rounds, the
-        parameters lie within the region of the last."""
+        parameters lie within the region of the last. Raises InputError where all truths fail."""
         checks.integer("truths", truths, least=2)
         checks.integer("samples", samples, least=9)
         within = self.estimator.region
         points = random_points(self.task, self.prior, truths, stream=STREAM, region=within)
-        found = simulate_points(self.task, points, _first(STREAM))
+        found = simulate_points(self.task, points, _first(self.task, STREAM))
+        _check_some(found)
         hidden, seen = points[found.sound], found.statistics[found.sound]
         drawn = self.estimator.sample(seen, samples, seed=self.task.seed + 1)
         here = self.estimator.log_density(hidden[:, None], seen)
@@ -256,10 +257,9 @@ class Posterior:
         rows = np.random.default_rng([self.task.seed, PREDICTED]).integers(
             len(self.points), size=count
         )
-        found = simulate_points(self.task, self.points[rows], _first(PREDICTED))
+        found = simulate_points(self.task, self.points[rows], _first(self.task, PREDICTED))
+        _check_some(found)
         sound = found.sound
-        if not sound.any():
-            raise tf.InputError(f"all {count} simulations failed: {found.failures()[0][0]}")
         return Prediction(
             self.observed, found.points[sound], found.statistics[sound], int((~sound).sum())
         )
@@ -278,10 +278,19 @@ class Posterior:
         return found
 
 
-def _first(stream: int) -> int:
+def _first(task: Task, stream: int) -> int:
     """The number of the first simulation of a stream, whose random numbers no simulation that is
     learnt from, and none of another stream, has used."""
-    return 2**24 + stream * 2**20
+    room = 2**32 // (task.replicates * task.conditions)  # each colony has a number below 2**32
+    part = min(2**20, room // 32)
+    return (16 + stream) * part
+
+
+def _check_some(found: Simulations) -> None:
+    """Raise InputError where all simulations failed."""
+    if not found.sound.any():
+        why = found.failures()[0][0]
+        raise tf.InputError(f"all {len(found)} simulations failed: {why}")
 
 
 def _most_frequent(values: np.ndarray) -> Value:

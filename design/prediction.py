@@ -11,6 +11,7 @@ import numpy as np
 import torchfilm as tf
 from design.fit_plot import Curve, draw_readings, measures_of
 from design.targets.observed import Observed
+from design.targets.observed_conditions import standard_errors
 from design.targets.readings import readings_of
 from torchfilm import checks
 
@@ -39,11 +40,12 @@ class Prediction:
 
     @property
     def losses(self) -> np.ndarray:
-        """Of each simulation the mean of ((statistic − value)/spread)², (n,). Where the model is
-        right and the posterior narrow, it is about 2, since data and simulation both scatter; it is
-        more where fewer than three colonies were observed, whose spread is underrated."""
-        apart = (self.statistics - np.array(self.observed.values)) / np.array(self.observed.spread)
-        return np.square(apart).mean(1)
+        """Of each simulation the mean of ((statistic − value)/error)², (n,), with the standard
+        errors of the values: their spreads, by the root of the number of colonies. Where the model
+        is right and the posterior narrow, it is about 2, since data and simulation both scatter; it
+        is more where fewer than three colonies were observed, whose spread is underrated."""
+        apart = self.statistics - np.array(self.observed.values)
+        return np.square(apart / standard_errors(self.observed)).mean(1)
 
     @property
     def places(self) -> dict[str, float]:

@@ -5,16 +5,18 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 import torchfilm as tf
 from design.entries import Entry
 from design.known import KnownDesigns
-from design.methods import Batch, Method
+from design.methods import METHODS, Batch, Method, method_of
 from design.objective import Objective
 from design.study import Study
 from design.task import Task
+from torchfilm import checks
 
 
 @dataclass(eq=False)
@@ -35,7 +37,7 @@ class Proposal:
         """The batch of a number, from 0: the known designs first of all, then what a method
         proposes."""
         if known is not None and number == 0:
-            return cls(Batch(known.points), known=True)
+            return cls(Batch(known.points), known=True)  # their losses alone are told
         begun = time.perf_counter()
         batch = method.ask()
         seconds = time.perf_counter() - begun
@@ -76,8 +78,8 @@ class Proposal:
         study.add(self.entry, replace=not first)
 
     def tell(self, method: Method) -> None:
-        """Let a method learn the whole batch. Methods that never ask for slopes need not take
-        any."""
+        """Let a method learn the whole batch. Methods that never ask for slopes or residuals need
+        not take any."""
         assert self.entry is not None
         found = self.entry.loss if self.entry.goals is None else self.entry.goals
         if self.known:
@@ -86,10 +88,10 @@ class Proposal:
                 know(self.entry.points, found)
             return
         batch = replace(self.batch, points=self.entry.points)
-        if batch.slopes:
-            method.tell(batch, found, self.entry.slopes)  # type: ignore[call-arg]
-        else:
-            method.tell(batch, found)
+        more: dict[str, Any] = {"slopes": self.entry.slopes} if batch.slopes else {}
+        if batch.residuals:
+            more["residuals"] = self.entry.residuals
+        method.tell(batch, found, **more)
 
 
 def repeat_study(
@@ -120,3 +122,26 @@ def repeat_study(
             return proposal
         proposal.tell(method)
     return None
+
+
+def checked_method(method: str | Method, task: Task) -> str | Method:
+    """The method of a search; "auto" stays. Raises InputError for one that is not allowed."""
+    if isinstance(method, str):
+        checks.choice("method", method, ("auto", *METHODS))
+        if method == "auto":
+            return method
+    found = method_of(method)
+    several = bool(getattr(found, "several", False))
+    if several != bool(task.goals):
+        raise checks.input_error(
+            "method",
+            type(found).__name__,
+            'one for several goals, such as "nsga2"' if task.goals else "one for one target",
+            "" if task.goals else "NSGA2 needs targets=[…].",
+        )
+    if getattr(found, "squares", False) and not task.target.comparable:
+        raise checks.input_error(
+            "method", type(found).__name__, "one for any target",
+            f"{type(found).__name__} needs the residuals of data, such as Observed or Measured.",
+        )  # fmt: skip
+    return found

@@ -15,6 +15,7 @@ import torch
 import torchfilm as tf
 from design import colonies, memory
 from design.derivatives import Gathered
+from design.entries import joined_residuals
 from design.growing import FinishedColonies, grow
 from design.parameters import Value
 from design.scene_family import UnfitDesign, why_rough
@@ -28,16 +29,19 @@ from design.task import Task
 class WorkItem:
     """Part of an evaluation: the rows of designs whose scenes have the same structure, and the
     values of their parameters. tangents: for the derivatives, of each design the tangents of its
-    copies (`derivatives.along`); None where only losses are wanted."""
+    copies (`derivatives.along`); None where only losses are wanted. residuals: whether those of a
+    comparable target are wanted."""
 
     rows: tuple[int, ...]
     values: tuple[dict[str, Value], ...]
     tangents: tuple[list[dict[str, float]], ...] | None = None
+    residuals: bool = False
 
     def take(self, places: Sequence[int]) -> WorkItem:
         """The designs at some places."""
         of = lambda x: tuple(x[k] for k in places)
-        return WorkItem(of(self.rows), of(self.values), self.tangents and of(self.tangents))
+        tangents = self.tangents and of(self.tangents)
+        return WorkItem(of(self.rows), of(self.values), tangents, self.residuals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +49,7 @@ class WorkResult:
     """The result of a work item: losses and cells (n, R), and the reasons of failures by (row of
     the item, replicate). why_regrown: the reason why no recorded growth was used, or "". slopes: of
     the n · R colonies, where they were asked for. goals: of each colony (n, R, G), NaN where it
-    failed; None where all did."""
+    failed; None where all did. residuals: (n, R, K) where they were asked for, so too."""
 
     losses: np.ndarray
     cells: np.ndarray
@@ -53,6 +57,7 @@ class WorkResult:
     why_regrown: str
     slopes: Slopes | None = None
     goals: np.ndarray | None = None
+    residuals: np.ndarray | None = None
 
 
 def cut_work_items(
@@ -62,12 +67,12 @@ def cut_work_items(
     size: float,
     least: int,
     tangents: Sequence[list[dict[str, float]]] | None = None,
+    residuals: bool = False,
 ) -> list[WorkItem]:
     """Cut designs into at least `least` parts, where there are as many designs. One scene can hold
-    each part, and one batch fits into memory. tangents: as `WorkItem` has them."""
-    whole = WorkItem(
-        tuple(range(len(values))), tuple(values), None if tangents is None else tuple(tangents)
-    )
+    each part, and one batch fits into memory. tangents, residuals: as `WorkItem` has them."""
+    of_copies = None if tangents is None else tuple(tangents)
+    whole = WorkItem(tuple(range(len(values))), tuple(values), of_copies, residuals)
     colonies_each = replicates * task.conditions * (1 if tangents is None else len(tangents[0]))
     structural = [p.name for p in task.space.parameters if p.structural]
     groups: dict[tuple[str, ...], list[int]] = {}
@@ -157,6 +162,7 @@ def run_work_item(task: Task, item: WorkItem, streams: tuple[int, ...], size: fl
         first.why_regrown or second.why_regrown,
         None if first.slopes is None else joined([first.slopes, second.slopes]),
         np.concatenate([_goals(task, part, replicates) for part in (first, second)]),
+        joined_residuals([(x.residuals, x.losses.shape) for x in (first, second)]),
     )
 
 
@@ -190,6 +196,7 @@ def _grow_and_score(
         goals = np.full((count * replicates, task.goals), np.nan)
         cells = np.zeros(count * replicates, np.int64)
         gathered = Gathered(task.space, count * replicates) if item.tangents else None
+        residuals: dict[int, np.ndarray] = {}
         reasons: dict[tuple[int, int], str] = {}
         most_cells, until = task.end(size)
         note = task.target.course if item.tangents else task.target.note
@@ -212,6 +219,9 @@ def _grow_and_score(
             if isinstance(task.target, Goals):
                 each = task.target.losses(event.state, event.history).cpu().numpy()[first]
                 goals[ids] = np.where(good[:, None], each, np.nan)
+            if item.residuals:
+                apart = _residuals(task.target, event)[first]
+                residuals |= {k: apart[at] for at, k in enumerate(ids) if good[at]}
             cells[ids] = event.state.counts.cpu().numpy()[first]
             if gathered is not None:
                 gathered.add(task.target, event, ids, places)
@@ -219,7 +229,7 @@ def _grow_and_score(
     shape, slopes = (count, replicates), None if gathered is None else gathered.slopes
     found = WorkResult(
         losses.reshape(shape), cells.reshape(shape), reasons, prepared.why_regrown, slopes,
-        goals.reshape(*shape, task.goals),
+        goals.reshape(*shape, task.goals), _in_rows(residuals, shape),
     )  # fmt: skip
     return found if task.conditions == 1 else _of_replicates(task, found)
 
@@ -237,7 +247,8 @@ def _places(numbers: np.ndarray, copies: int) -> np.ndarray:
 
 def _of_replicates(task: Task, found: WorkResult) -> WorkResult:
     """The result of replicates (n, R), from that of their colonies, one under each condition: the
-    mean of their losses, and the fewest cells. Where one failed, the replicate did."""
+    mean of their losses, and the fewest cells. Where one failed, the replicate did. Each of its
+    residuals is that of one condition, 0 in the colonies under others."""
     shape = (len(found.losses), -1, task.conditions)
     reasons: dict[tuple[int, int], str] = {}
     for (row, k), words in sorted(found.reasons.items()):
@@ -252,7 +263,14 @@ def _of_replicates(task: Task, found: WorkResult) -> WorkResult:
         slopes = slopes.reduced(np.full((losses.size, task.conditions), 1.0 / task.conditions))
         failed = [row * losses.shape[1] + replicate for row, replicate in reasons]
         slopes.put(failed, Slopes.none(len(failed), task.space.size))
-    return replace(found, losses=losses, cells=cells, reasons=reasons, slopes=slopes, goals=None)
+    residuals = found.residuals
+    if residuals is not None:
+        each = residuals.reshape(*losses.shape, task.conditions, -1)
+        residuals = each.sum(2) / math.sqrt(task.conditions)
+    return replace(
+        found, losses=losses, cells=cells, reasons=reasons, slopes=slopes, goals=None,
+        residuals=residuals,
+    )  # fmt: skip
 
 
 def _below_failed(target: Target, score: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:
@@ -311,6 +329,23 @@ def _scores(target: Target, finished: FinishedColonies) -> np.ndarray:
             " each colony"
         )
     return found.double().cpu().numpy()
+
+
+def _residuals(target: Target, finished: FinishedColonies) -> np.ndarray:
+    """The residuals of finished colonies, (B, K)."""
+    found = target.residuals(finished.state, finished.history)
+    assert found is not None  # a comparable target has some
+    return found.double().cpu().numpy()
+
+
+def _in_rows(each: dict[int, np.ndarray], shape: tuple[int, int]) -> np.ndarray | None:
+    """Residuals (n, R, K) from those of each colony (K,) by its number, NaN where it failed; None
+    where all did."""
+    if not each:
+        return None
+    out = np.full((shape[0] * shape[1], len(next(iter(each.values())))), np.nan)
+    out[list(each)] = list(each.values())
+    return out.reshape(*shape, -1)
 
 
 @tf.one_torch_thread()

@@ -18,10 +18,10 @@ from design.finals import MOST_SHARE, Finals, FinalsRun, fresh_losses, winner
 from design.front import Front, front_of
 from design.growing import FinishedColonies
 from design.known import KnownDesigns, Start, known_designs
-from design.methods import METHODS, Chosen, Exhaustive, Method, choose, designs_of, method_of
+from design.methods import Chosen, Exhaustive, Method, choose, designs_of, method_of
 from design.objective import Objective
 from design.progress import advance, finish, open_bar
-from design.proposal import Proposal, repeat_study
+from design.proposal import Proposal, checked_method, repeat_study
 from design.remarks import all_failed, remark_on_batch, remark_on_begin, remark_on_end
 from design.study import Study
 from design.task import Task, TaskOptions
@@ -89,7 +89,7 @@ class Search(TaskOptions):
             seed = checks.integer("method_seed", self.method_seed, least=0)
             object.__setattr__(self, "method_seed", seed)
         known = None if self.start is None else known_designs(self.start, task)
-        chosen = _check_method(self.method, task)
+        chosen = checked_method(self.method, task)
         for name, value in (
             ("method", chosen), ("objective", Objective(task)), ("_known", known)
         ):  # fmt: skip
@@ -235,7 +235,7 @@ class Search(TaskOptions):
             streams = task.streams(None)[: part.replicates]
             found = self.objective.evaluate(
                 part.points, streams=streams, size=part.size, executor=executor,
-                work_items=work_items, slopes=part.slopes,
+                work_items=work_items, slopes=part.slopes, residuals=part.residuals,
             )  # fmt: skip
             proposal.take(found.entry(streams), self.study)
             within_reach = within_reach or check_within_reach(self.objective, self.study)
@@ -351,10 +351,11 @@ class Search(TaskOptions):
             # where choices are resolved, several designs are one
             math.inf if task.space.digest else designs_of(task.space),
             (colonies - self._reserved(colonies)) / task.colonies_each,
+            task.target.comparable and not task.space.has_choices,
         )
         told = task.tried.stochastic or isinstance(chosen.method, Exhaustive) or before
         why = "" if told else self.objective.why_no_squares
-        return replace(chosen, why=f"{chosen.why}; no least squares: {why}") if why else chosen
+        return replace(chosen, why=f"{chosen.why}; no exact derivatives: {why}") if why else chosen
 
     def _open_study(self, path: str | Path | None, method: str) -> Study:
         task = self.objective.task
@@ -399,21 +400,3 @@ def _none_yet() -> tf.InputError:
     return tf.InputError(
         "no design has been grown to full size yet: run the search for more colonies."
     )
-
-
-def _check_method(method: str | Method, task: Task) -> str | Method:
-    """The method of a search; "auto" stays. Raises InputError for one that is not allowed."""
-    if isinstance(method, str):
-        checks.choice("method", method, ("auto", *METHODS))
-        if method == "auto":
-            return method
-    found = method_of(method)
-    several = bool(getattr(found, "several", False))
-    if several != bool(task.goals):
-        raise checks.input_error(
-            "method",
-            type(found).__name__,
-            'one for several goals, such as "nsga2"' if task.goals else "one for one target",
-            "" if task.goals else "NSGA2 needs targets=[…].",
-        )
-    return found

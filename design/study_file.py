@@ -8,6 +8,7 @@
                   was not grown; reasons, JSON by replicate; goals (N, G) and each_goals (N, R, G),
                   where there are several
     /slopes/K/    gradient (n, D) and curvature (n, D, D) of batch K, where they were wanted
+    /residuals/K  (n, number of readings) of batch K, where they were wanted
     /values/NAME  (N,) the values of each parameter; as JSON where numbers are mixed with text
     /finals/      the same of the finals, the designs on fresh seeds
 
@@ -88,6 +89,9 @@ def _write_entries(
         if slopes is not None:
             group[f"slopes/{number}/gradient"] = slopes.gradient
             group[f"slopes/{number}/curvature"] = slopes.curvature
+    for number, entry in enumerate(entries):
+        if entry.residuals is not None:
+            group[f"residuals/{number}"] = entry.residuals
     words = [
         json.dumps({str(k): e.reasons[r, k] for k in range(e.replicates) if (r, k) in e.reasons})
         for e in entries
@@ -150,6 +154,7 @@ def _read_entries(group: h5py.Group, streams: tuple[int, ...] | None = None) -> 
                     designs["each_goals"][mine, :replicates] if "each_goals" in designs else None
                 ),
                 choosing=choosing,
+                residuals=_read_residuals(group, len(out)),
             )
         )
         at += rows
@@ -159,6 +164,11 @@ def _read_entries(group: h5py.Group, streams: tuple[int, ...] | None = None) -> 
     if not np.isfinite(designs["loss"]).all():
         raise ValueError("a design has no loss")
     return out
+
+
+def _read_residuals(group: h5py.Group, batch: int) -> np.ndarray | None:
+    found = group.get(f"residuals/{batch}")
+    return None if found is None else found[...]
 
 
 def _read_slopes(group: h5py.Group, batch: int) -> Slopes | None:

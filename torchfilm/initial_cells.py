@@ -99,7 +99,7 @@ class Cells(metaclass=checks.KnownKeywords):
                     "Cells column",
                     name,
                     "a name that the state does not use itself",
-                    "Rename or delete it.",
+                    "Rename or delete it; of a table, fields=[…] says which columns to take.",
                 )
         parts["extra"] = {name: _column(name, values, count) for name, values in self.extra.items()}
         for name, values in parts.items():

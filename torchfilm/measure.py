@@ -367,8 +367,8 @@ def _place(measure: str, state: State, along: str | Tensor) -> Tensor:
 def correlation(state: State, name: str | Tensor, edges: row_checks.Numbers) -> Tensor:
     """How alike a quantity y is in two cells of a colony by the distance of their centres, (B, K)
     float64: the mean of (yᵢ − ȳ)(yⱼ − ȳ) over the pairs in each bin of distances, over the variance
-    of y. 1 for pairs that are as alike as a cell is itself, 0 where nothing is shared; its first
-    maximum beyond 0 is the wavelength of a pattern. NaN without pairs, or variance.
+    of y. 1 for pairs as alike as a cell is itself, 0 where nothing is shared (−1/(n − 1) of n
+    cells); its first maximum beyond 0 is the wavelength of patterns. NaN without pairs or variance.
 
     name: as for `profile`. edges: of the bins, K + 1 of them, µm, ascending from 0 or more. In a
     periodic space distances are those to the nearest image."""

@@ -9,6 +9,7 @@ from design.methods.base import Batch, Method
 from design.methods.bayesian import Bayesian
 from design.methods.cmaes import CMAES
 from design.methods.exhaustive import Exhaustive, designs_of
+from design.methods.gauss_newton import GaussNewton
 from design.methods.local import Local
 from design.methods.nsga2 import NSGA2
 from design.methods.polish import Polish
@@ -23,6 +24,7 @@ METHODS: dict[str, type[Any]] = {
     "racing": Racing,
     "local": Local,
     "polish": Polish,
+    "gauss-newton": GaussNewton,
     "nsga2": NSGA2,
     "exhaustive": Exhaustive,
 }
@@ -35,6 +37,7 @@ __all__ = [
     "Bayesian",
     "Chosen",
     "Exhaustive",
+    "GaussNewton",
     "Local",
     "Method",
     "Polish",

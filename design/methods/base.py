@@ -35,13 +35,15 @@ class Batch:
 
     points: (n, D), each coordinate in [0, 1]. size: the share of the full colony size to grow,
     above 0, at most 1. replicates: how many replicates of each point to grow; None is all. slopes:
-    whether `tell` needs derivatives too. Raises InputError for values that are not allowed.
+    whether `tell` needs derivatives too; residuals: whether it needs those of data. Raises
+    InputError for values that are not allowed.
     """
 
     points: np.ndarray
     size: float = 1.0
     replicates: int | None = None
     slopes: bool = False
+    residuals: bool = False
 
     def __post_init__(self) -> None:
         points = np.array(self.points, dtype=np.float64)
@@ -66,7 +68,9 @@ class Batch:
 
 class Method(Protocol):
     """How a search chooses points. Any object with these three functions can be the method of a
-    search. `tell` gets a third argument, `Slopes`, where the batch asked for them.
+    search. `tell` gets `slopes=` or `residuals=`, too, where the batch asked for them: `Slopes`, or
+    numbers (n, K) whose squares add up to the loss but for the scatter between replicates, NaN for
+    a design that failed, None where all did.
 
     The result of `ask` must depend only on the arguments of `start`, the method's settings, and all
     calls of `tell`: a new method resumes a stopped search from the batches and losses of its study.
@@ -138,16 +142,24 @@ class AskTell(metaclass=checks.KnownKeywords):
             self._batch = self._next()
         return self._batch
 
-    def tell(self, batch: Batch, loss: np.ndarray, slopes: Slopes | None = None) -> None:
+    def tell(
+        self,
+        batch: Batch,
+        loss: np.ndarray,
+        slopes: Slopes | None = None,
+        residuals: np.ndarray | None = None,
+    ) -> None:
         """Learn the losses of a batch: (n,), lower is better, finite (a design that failed has a
-        bad but finite loss); slopes: where the batch asked for them.
+        bad but finite loss); slopes, residuals: where the batch asked for them.
 
         Batches are given in the order of `ask`. Raises InputError for a batch that `ask` did not
         return.
         """
         self._started()
         self._meet(batch)
-        if not batch.slopes:
+        if batch.residuals:
+            self._compare(batch, scores(batch, loss), residuals)
+        elif not batch.slopes:
             self._take(batch, scores(batch, loss))
         elif slopes is None:
             raise checks.input_error("slopes", None, "given, since the batch asked for them")
@@ -192,6 +204,10 @@ class AskTell(metaclass=checks.KnownKeywords):
 
     def _descend(self, loss: np.ndarray, slopes: Slopes) -> None:
         """Learn from a batch with slopes."""
+        raise NotImplementedError
+
+    def _compare(self, batch: Batch, loss: np.ndarray, residuals: np.ndarray | None) -> None:
+        """Learn from a batch with residuals."""
         raise NotImplementedError
 
 

@@ -62,7 +62,13 @@ class NSGA2(AskTell):
         self._asked = self._search.ask()
         return Batch(snap(np.array(self._asked.get("X"), dtype=np.float64), self._space.levels))  # type: ignore[union-attr]
 
-    def tell(self, batch: Batch, loss: np.ndarray, slopes: Slopes | None = None) -> None:
+    def tell(
+        self,
+        batch: Batch,
+        loss: np.ndarray,
+        slopes: Slopes | None = None,
+        residuals: np.ndarray | None = None,
+    ) -> None:
         self._started()
         self._meet(batch)
         points, goals = batch.points, _goals(batch.points, loss)

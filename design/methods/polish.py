@@ -44,6 +44,8 @@ class Polish(AskTell):
             raise checks.input_error("Polish.inner", self.inner, "a method, such as Racing()")
         if getattr(self.inner, "several", False):
             raise checks.input_error("Polish.inner", self.inner, "a method for one target")
+        if getattr(self.inner, "squares", False):
+            raise checks.input_error("Polish.inner", self.inner, "a method that needs losses alone")
         self.after = checks.integer("Polish.after", self.after, least=1)
         self.starts = checks.integer("Polish.starts", self.starts, least=1)
 

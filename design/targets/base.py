@@ -42,6 +42,8 @@ class Target(metaclass=checks.KnownKeywords):
     fewest: ClassVar[int] = 1
     # whether answers without a pattern, such as evenly lit cells, say what a loss is worth
     pattern: ClassVar[bool] = True
+    # whether each of its residuals is the same number of every colony, such as a mean
+    comparable: ClassVar[bool] = False
     # whether it asks how many cells are lit, and not which
     anywhere: ClassVar[bool] = False
 

@@ -50,11 +50,14 @@ class Measured(Target):
     unless it does not depend on levels, as the volume of a colony does not.
 
     time: h, when the values were measured, at which colonies then end. Measures of several times
-    make a course: `ObservedCourse([Measured(…, time=1.0), Measured(…, time=2.0)])`.
+    make a course: `ObservedCourse([Measured(…, time=1.0), Measured(…, time=2.0)])`. colonies: over
+    how many the values are means, for `infer`, which averages over as many simulated ones; spread
+    is then the error of the mean, beyond what differs between colonies.
     """
 
     failed = WORST
     pattern = False
+    comparable = True
     functions: Mapping[str, Measure]
     wanted: Mapping[str, float | tuple[float, float]]
     spread: Mapping[str, float]
@@ -62,6 +65,7 @@ class Measured(Target):
     extinct: bool = False
     smooth: bool = False
     time: float | None = None
+    colonies: int = 1
     _warned: bool = field(default=False, init=False, repr=False, compare=False)
 
     @property
@@ -71,6 +75,7 @@ class Measured(Target):
     def __post_init__(self) -> None:
         checks.choice("Measured.extinct", self.extinct, (True, False))
         checks.choice("Measured.smooth", self.smooth, (True, False))
+        checks.integer("Measured.colonies", self.colonies, least=1)
         if self.time is not None:
             checks.number("Measured.time", self.time, above=0.0)
         if not isinstance(self.functions, Mapping) or not self.functions:

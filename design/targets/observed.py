@@ -18,25 +18,19 @@ from design.targets.measured import in_words
 from design.targets.observed_like import counted, named, shared_plan, with_caps
 from design.targets.observed_masks import masks_table
 from design.targets.observed_table import read_table, warn_of_empty
+from design.targets.observed_values import check_relative, values_of, warn_of_width
 from design.targets.statistics import (
     LOG_CELLS,
     ColonyStatistics,
     SeenCells,
     birth_note,
     known_statistics,
-    resampled_spread,
     seen_cells,
 )
 from torchfilm import checks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-ENOUGH = 3  # colonies from which on the spread between them is measured
-FINEST = 0.01  # the least spread, relative to the greatest statistic of its group
-# The least spread of the logarithm of a number of cells; and of the number itself, which is whole.
-COUNT, PART = 0.02, 0.5
-VARIED = 0.01  # the least spread of a coefficient of variation
 
 
 @dataclass(frozen=True)
@@ -45,7 +39,9 @@ class Observed(Target):
 
     values: the statistics (K,), means over the observed colonies; spread: of each, above 0; plan:
     which they are. colonies: how many were observed; cells: how many in all. time: h, when they
-    were observed, or None. Make one by `from_table`, `from_masks`, `from_state` or `from_results`.
+    were observed, or None; width: µm, the mean of the observed cells, where it is known: of a scene
+    with cells of another width there is a warning. Make one by `from_table`, `from_masks`,
+    `from_state` or `from_results`.
 
     The statistics are ln of the number of cells; the quantiles 10, 25, 50, 75 and 90 % of lengths
     and ages; the radius of gyration; cells per µm² in rings around the centre; the alignment of
@@ -67,6 +63,7 @@ class Observed(Target):
     """
 
     pattern = False
+    comparable = True
     values: tuple[float, ...]
     spread: tuple[float, ...]
     plan: ColonyStatistics
@@ -74,6 +71,7 @@ class Observed(Target):
     colonies: int = 1
     cells: int = 0
     time: float | None = None
+    width: float | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.plan, ColonyStatistics):
@@ -112,20 +110,21 @@ class Observed(Target):
         """The target of a table with one row for each cell: a CSV file with a header, or columns
         by name (a dictionary, or a pandas.DataFrame).
 
-        Columns, of which any may be missing: x and y, the centre; length; angle; age; colony, which
-        tells replicates apart; and those that `species` names: others are not compared. columns:
-        their names in the table where they differ, such as {"x": "centroid_x"}. Units stand in the
-        names of columns (x_um or x_px, angle_deg or angle_rad, age_h or age_min) or in arguments:
-        pixel_size, µm a pixel; length_unit "um"; angle_unit "degrees" or "radians"; time_unit "h"
-        or "min".
+        Columns, of which any may be missing: x and y, the centre; length; radius; angle; age;
+        colony, which tells replicates apart; and those that `species` names: others are not
+        compared. columns: their names in the table where they differ, such as {"x": "centroid_x"}.
+        Units stand in the names of columns (x_um or x_px, angle_deg or angle_rad, age_h or age_min)
+        or in arguments: pixel_size, µm a pixel; length_unit "um"; angle_unit "degrees" or
+        "radians"; time_unit "h" or "min".
 
         length_with_caps: lengths include the caps, as masks measure them. relative: levels count
         relative to their mean in the colony, for a reporter in arbitrary units. amounts: levels are
         those of whole cells, concentration × volume, as a flow cytometer measures them. quantiles:
         those of each reporter are compared, too, as where cells are in two states. rings: how many,
         out to where 95 % of the cells are. reach: µm; cells with closer centres are neighbours.
-        time: h, when the colonies were observed. like: another `Observed`, whose rings and options
-        are taken, so that both compare the same statistics; and its species, where none are given.
+        time: h, when the colonies were observed, where no column time_h or time_min says so. like:
+        another `Observed`, whose rings and options are taken, so that both compare the same
+        statistics; and its species, where none are given.
 
         Levels may be negative: less their background, those of dark cells are.
 
@@ -134,7 +133,7 @@ class Observed(Target):
         """
         names = named(species, like)
         units = tf.tables.Units(pixel_size, length_unit, angle_unit, time_unit)
-        cells = read_table(table, names, units, columns or {}, length_with_caps)
+        cells, time = read_table(table, names, units, columns or {}, length_with_caps, time)
         plan = known_statistics(
             cells, names, rings, reach, length_with_caps, relative, quantiles,
             counted(amounts, like),
@@ -248,6 +247,7 @@ class Observed(Target):
         size = table["volume"] if amounts else 1.0
         columns = {
             "colony": table["colony"],
+            "radius_um": table["radius"],
             "x_um": table["x"],
             "y_um": table["y"],
             "length_um": table["length"] + (2.0 * table["radius"] if length_with_caps else 0.0),
@@ -286,6 +286,7 @@ class Observed(Target):
 
     def check(self, state: tf.State) -> None:
         self.plan.check(state)
+        warn_of_width(self.width, state)
 
     def unfit(self, state: tf.State) -> list[str]:
         return [ended_elsewhere(state, self.time)] * state.colonies
@@ -391,29 +392,8 @@ class Observed(Target):
 
 def _observed(cells: SeenCells, plan: ColonyStatistics, time: float | None) -> Observed:
     """The target of some cells."""
-    with torch.no_grad():
-        each = plan.of(cells)
-        count = len(cells.counts)
-        resampled = [resampled_spread(cells, plan, k) for k in range(count)]
-        spread = torch.stack(resampled).square().mean(0).sqrt()
-        if count >= ENOUGH:
-            between = each.std(0)
-            # of few colonies it is small by chance, and it contains that of drawing cells; but
-            # divisions in step make numbers of cells more alike than independent ones would
-            at = plan.names.index(LOG_CELLS) if LOG_CELLS in plan.names else None
-            spread = torch.maximum(spread, between)
-            if at is not None:
-                spread[at] = between[at]
-    least = torch.cat([
-        each[:, [plan.names.index(n) for n in names]].abs().max().mul(FINEST).expand(len(names))
-        for names in plan.groups.values()
-    ])  # fmt: skip
-    if plan.names[0] == LOG_CELLS:
-        least[0] = max(COUNT, PART / float(cells.counts.double().mean()))
-    alike = torch.tensor([VARIED if n.endswith("_cv") else 0.0 for n in plan.names])
-    least = torch.maximum(least, alike.to(least))
-    spread = torch.maximum(spread, least)
-    spread = torch.where(spread > 0, spread, 1.0)  # a reporter that is dark in all cells
-    total = int(cells.counts.sum())
-    mean = tuple(each.mean(0).tolist())
-    return Observed(mean, tuple(spread.tolist()), plan, colonies=count, cells=total, time=time)
+    check_relative(cells, plan)
+    values, spread = values_of(cells, plan)
+    count, total = len(cells.counts), int(cells.counts.sum())
+    width = None if cells.radius is None else 2.0 * float(cells.radius.double().mean())
+    return Observed(values, spread, plan, colonies=count, cells=total, time=time, width=width)

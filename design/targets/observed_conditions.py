@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -131,6 +133,19 @@ def grown(observed: Observed) -> Target:
     return observed.conditions if isinstance(observed, ObservedConditions) else observed
 
 
+def standard_errors(observed: Observed) -> np.ndarray:
+    """Of the values, (K,): the spread of cells is that of single colonies, and each value a mean
+    over some; that of measured numbers is their error."""
+    if isinstance(observed, ObservedConditions):
+        parts: tuple[Any, ...] = observed.conditions.parts
+    elif isinstance(observed, ObservedCourse):
+        parts = observed.frames
+    else:
+        own = 1 if isinstance(observed, ObservedMeasures) else observed.colonies
+        return np.array(observed.spread) / math.sqrt(own)
+    return np.concatenate([standard_errors(part) for part in parts])
+
+
 def averaged(observed: Observed, replicates: int) -> list[int]:
     """Over how many of the `replicates` of a simulation each statistic is averaged, (K,): over as
     many as colonies were observed of it, where all are simulated that the best observed had."""
@@ -148,12 +163,14 @@ def _colonies(observed: Observed) -> list[int]:
 
 def cells_each(observed: Observed) -> float:
     """How many cells of a colony were observed at the end, on average; 0 where some are not
-    known."""
+    known, or were observed before the end alone."""
     if isinstance(observed, ObservedConditions):
         parts = [cells_each(cast(Observed, part)) for part in observed.conditions.parts]
         return sum(parts) / len(parts) if all(parts) else 0.0
-    last = observed.frames[-1] if isinstance(observed, ObservedCourse) else observed
-    return last.cells / last.colonies
+    if not isinstance(observed, ObservedCourse):
+        return observed.cells / observed.colonies
+    at_end = [frame for frame in observed.frames if frame.time == observed.time]
+    return max((frame.cells / frame.colonies for frame in at_end), default=0.0)
 
 
 def places(observed: Observed) -> list[int]:

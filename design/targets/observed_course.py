@@ -17,6 +17,12 @@ import torchfilm as tf
 from design.targets.base import ended_elsewhere, huber
 from design.targets.measured import Measure, Measured
 from design.targets.observed import Observed
+from design.targets.observed_frames import (
+    mask_frames,
+    measured_frames,
+    results_frames,
+    state_frames,
+)
 from design.targets.observed_measures import MeasureStatistics, ObservedMeasures, as_data
 from design.targets.statistics import LOG_CELLS, ColonyStatistics, birth_note
 from torchfilm import checks, tables
@@ -76,11 +82,11 @@ class ObservedCourse(Observed):
     of `Observed` with a `time` each, for a search or `infer`. Numbers that a plate reader or a
     count gives at each time are a course by `of_measures`.
 
-    frames: in the order of their times, each an `Observed` or a `Measured`, in a search also one
-    with ranges; whether each frame shows the same colonies, or as many, does not matter. A
-    simulated colony is compared at each of these times, which must be whole numbers of steps, and
-    ends at the last one. Ages are compared as a colony ends only. The statistics of frame k have
-    its time in their names: "gfp_mean at 2 h".
+    frames: in the order of their times, each an `Observed` or a `Measured`, of which two may have
+    one time, in a search also one with ranges; whether each frame shows the same colonies, or as
+    many, does not matter. A simulated colony is compared at each of these times, which must be
+    whole numbers of steps, and ends at the last one. Ages are compared as a colony ends only. The
+    statistics of frame k have its time in their names: "gfp_mean at 2 h".
 
     The loss is that of `Observed` with the statistics of all frames, each weighted alike. They are
     not independent: one colony is seen several times. Raises InputError for frames without a time
@@ -190,7 +196,35 @@ class ObservedCourse(Observed):
         name, a standard error above 0, or one for each time. Raises InputError for other names,
         lengths or times, and where fewer than two times have a value.
         """
-        return ObservedCourse(_measured(functions, times, values, spread, extinct, smooth))
+        return ObservedCourse(measured_frames(functions, times, values, spread, extinct, smooth))
+
+    @staticmethod
+    @checks.known_keywords
+    def from_masks(  # type: ignore[override]
+        masks: Sequence[Any],
+        *,
+        times: Sequence[float],
+        fluorescence: Mapping[str, Sequence[Any]] | None = None,
+        **options: Any,
+    ) -> ObservedCourse:
+        """Label images of several times: for each of `times`, h, what `Observed.from_masks` takes,
+        an image or a list of images, each of a colony; of a reporter as many images. Further
+        keywords: options of that. Raises InputError as it does, and for other numbers of times."""
+        return ObservedCourse(mask_frames(masks, times, fluorescence, options))
+
+    @staticmethod
+    def from_state(states: Sequence[tf.State], **options: Any) -> ObservedCourse:  # type: ignore[override]
+        """States of several times, in their order. Further keywords: options of
+        `Observed.from_state`."""
+        return ObservedCourse(state_frames(states, options))
+
+    @staticmethod
+    def from_results(  # type: ignore[override]
+        path: str | Path, frames: Sequence[int] | None = None, **options: Any
+    ) -> ObservedCourse:
+        """Frames of a results file, by default all but that of the founders. Further keywords:
+        options of `Observed.from_results`."""
+        return ObservedCourse(results_frames(path, frames, options))
 
     @property
     def times(self) -> tuple[float, ...]:
@@ -266,7 +300,8 @@ class ObservedCourse(Observed):
         noted = history[:, :, 0]  # the time of each step
         earlier = [((noted - t).abs() <= 1e-6 * t).any(0) for t in self.times[: len(self._noted)]]
         ended = not ended_elsewhere(state, self.time)
-        last = [~torch.stack(earlier).any(0) | ended for _ in self._last]
+        none = torch.zeros(len(noted[0]), dtype=torch.bool, device=noted.device)
+        last = [~torch.stack([none, *earlier]).any(0) | ended for _ in self._last]
         return [reached.unsqueeze(1) for reached in (*earlier, *last)]
 
     def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor:
@@ -310,7 +345,7 @@ class ObservedCourse(Observed):
         self.frames[-1].draw(ax, state, place)
 
     def describe(self) -> str:
-        times = ", ".join(f"{t:g}" for t in self.times)
+        times = ", ".join(f"{t:g}" for t in dict.fromkeys(self.times))
         if all(isinstance(f, ObservedMeasures) for f in self.frames):
             names = dict.fromkeys(n for f in self.frames for n in f.plan.names)
             return f"measured at {times} h: {', '.join(names)}"
@@ -352,60 +387,12 @@ def _checked(frames: object) -> tuple[Observed, ...]:
                 f"ObservedCourse.frames[{k}].time", None, "the time of the frame, h",
                 "Give time=… where you read it.",
             )  # fmt: skip
-        if k and frame.time <= (found[-1].time or 0.0):
+        same = k and frame.time == found[-1].time and type(frame) is not type(found[-1])
+        if k and frame.time <= (found[-1].time or 0.0) and not same:
             raise checks.input_error(
                 f"ObservedCourse.frames[{k}].time", frame.time,
                 f"above that of the frame before, {found[-1].time:g} h",
+                "An Observed and a Measured may have one time.",
             )  # fmt: skip
         found.append(frame)
     return tuple(found)
-
-
-def _measured(
-    functions: Any, times: Any, values: Any, spread: Any, extinct: bool, smooth: bool
-) -> list[Measured]:
-    """The measures at each time, of those that are known there."""
-    call = "ObservedCourse.of_measures"
-    rule = "a dict of functions by name, such as {'od': total_volume}"
-    if not isinstance(functions, Mapping) or not functions:
-        raise checks.input_error(f"{call}: functions", functions, rule)
-    moments = checks.vector(f"{call}: times", times)
-    if min(moments, default=1.0) <= 0.0:
-        hint = "Leave such readings out: a scene's founders and `initial=` say how colonies begin."
-        raise checks.input_error(f"{call}: times", list(moments), "above 0 h", hint)
-    columns = {}
-    for option, given in (("values", values), ("spread", spread)):
-        if not hasattr(given, "keys") or set(given.keys()) != set(functions):
-            rule = f"numbers by the names {', '.join(map(repr, functions))}"
-            raise checks.input_error(f"{call}: {option}", given, rule)
-        for name in functions:
-            label = f"{call}: {option}[{name!r}]"
-            columns[option, name] = _column(label, given[name], len(moments), option == "spread")
-    frames = []
-    for k, time in enumerate(moments):
-        there = [name for name in functions if not math.isnan(columns["values", name][k])]
-        parts = [
-            {name: columns[option, name][k] for name in there} for option in ("values", "spread")
-        ]
-        known = {name: functions[name] for name in there}
-        if known:
-            frames.append(Measured(known, *parts, extinct=extinct, smooth=smooth, time=time))
-    if len(frames) < 2:
-        given = f"{len(moments)} times, of which {len(frames)} have a value"
-        hint = "Of one time, give Measured(…, time=…)."
-        raise checks.input_error(f"{call}: values", given, "of two times at least", hint)
-    return frames
-
-
-def _column(label: str, given: Any, count: int, one_will_do: bool) -> list[float]:
-    """A number for each time, NaN where one is missing."""
-    try:
-        if one_will_do and np.ndim(given) == 0:
-            return [float(given)] * count
-        found = [float(x) for x in given]
-    except (TypeError, ValueError):
-        found = []
-    if len(found) != count:
-        rule = f"{count} numbers, one for each time, NaN where it is missing"
-        raise checks.input_error(label, given, "a number, or " * one_will_do + rule)
-    return found

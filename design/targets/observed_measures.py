@@ -52,7 +52,7 @@ class ObservedMeasures(Observed):
             "values": tuple(values),
             "spread": spread,
             "plan": MeasureStatistics(tuple(measured.functions), spread, code),
-            "colonies": 1,
+            "colonies": measured.colonies,
             "cells": 0,
             "time": measured.time,
         }

@@ -17,7 +17,10 @@ from torchfilm import checks, tables
 COLONY, FRAME = "colony", "frame"
 # columns of times; each colony has one
 TIMES = ("time", "time_h", "time_min", "time_s", "timepoint", "t")
-KIND = {"x": "length", "y": "length", "length": "length", "angle": "angle", "age": "time"}
+KIND = {
+    "x": "length", "y": "length", "length": "length", "radius": "length", "angle": "angle",
+    "age": "time",
+}  # fmt: skip
 
 
 def read_table(
@@ -26,11 +29,13 @@ def read_table(
     units: tables.Units,
     columns: Mapping[str, str],
     length_with_caps: bool,
-) -> SeenCells:
-    """The cells of a table, sorted by colony. columns: names in the table where they differ.
+    time: float | None = None,
+) -> tuple[SeenCells, float | None]:
+    """The cells of a table, sorted by colony, and when they were observed, h: as a column says, or
+    `time`. columns: names in the table where they differ.
 
     Raises InputError for a column that is missing, is not numbers or has no unit, for several
-    frames, and for lengths and ages that no cell has.
+    frames or times, and for lengths and ages that no cell has.
     """
     given = tables.Table.read(table)
     meant = (*KIND, COLONY, *species)
@@ -54,9 +59,11 @@ def read_table(
             continue
         column, _, factor = known
         numbers = given.numbers(column)
-        if name in ("length", "age"):
-            _check_positive(given, column, numbers, name == "length" and length_with_caps)
+        if name in ("length", "age", "radius"):
+            above = name == "radius" or (name == "length" and length_with_caps)
+            _check_positive(given, column, numbers, above)
         found[name] = factor * torch.tensor(numbers)  # pandas may give what is read-only
+    time = _time(given, columns, units, used, time)
     units.check_used(used)
     for name in species:
         column = columns.get(name, name)
@@ -73,7 +80,7 @@ def read_table(
             f" {', '.join(given.columns)}. Name yours by columns={{…}}."
         )
     _check_twice(given, found, owner)
-    return _cells(found, species, owner)
+    return _cells(found, species, owner), time
 
 
 def _check_twice(
@@ -126,6 +133,40 @@ def _check_one_time(
             )
 
 
+def _time(
+    table: tables.Table,
+    columns: Mapping[str, str],
+    units: tables.Units,
+    used: set[tuple[str, str]],
+    stated: float | None,
+) -> float | None:
+    """When the cells were observed, h: as a column with a unit says, or as stated. Colonies of
+    several times, each of one, have none that is known. Raises InputError where both differ."""
+    known = table.column("time", "time", {})
+    if known is None or columns.get(COLONY) == known[0]:
+        return stated
+    column, named = known
+    unit = named or units.stated("time")
+    if not unit:
+        return stated  # it may be the number of a frame
+    if not named:
+        used.add(("time", unit))
+    times = np.unique(units.factor("time", unit, column) * table.numbers(column))
+    if len(times) > 1:
+        return stated
+    found = float(times[0])
+    if stated is not None and abs(found - stated) > 1e-6 * abs(stated):
+        rule = f"{found:g} h, as the column {column!r} says"
+        hint = "Leave the column out where it is another time."
+        raise checks.input_error("Observed(time)", stated, rule, hint)
+    if found <= 0.0:
+        raise tf.InputError(
+            f"{table.source}, column {column!r}: {found:g} h is not above 0. Cells of the first"
+            " frame say how runs begin, which Scene(founders=…) does."
+        )
+    return found
+
+
 def _check_one_frame(table: tables.Table, columns: Mapping[str, str]) -> None:
     """Raise InputError for several frames of one movie: their cells are no colony of one time."""
     column = next((c for c in table.columns if c.lower() == FRAME), None)
@@ -159,6 +200,7 @@ def _cells(
         length=get("length"),
         age=get("age"),
         levels=torch.stack([found[n] for n in species], 1)[order] if species else None,
+        radius=get("radius"),
     )
 
 

@@ -152,6 +152,10 @@ class SumOfTargets(Several):
     """The base class of those whose loss is a sum of those of their parts, so that it has residuals
     where all parts have."""
 
+    @property
+    def comparable(self) -> bool:  # type: ignore[override]
+        return all(part.comparable for part in self.parts)
+
     def course(self, state: tf.State) -> Tensor | None:
         """The notes of all parts, how many columns each needs besides, and these."""
         courses, notes = [p.course(state) for p in self.parts], [p.note(state) for p in self.parts]

@@ -31,7 +31,7 @@ class SeenCells:
     """The cells of B colonies, those of one colony side by side, as statistics need them.
 
     colony (N,) int64; counts (B,); position (N, 2) µm, axis (N, 2) unit vectors, length (N,) µm,
-    age (N,) h, levels (N, S) of S species; None where it is not known.
+    age (N,) h, levels (N, S) of S species, radius (N,) µm; None where it is not known.
     """
 
     colony: Tensor
@@ -41,6 +41,7 @@ class SeenCells:
     length: Tensor | None = None
     age: Tensor | None = None
     levels: Tensor | None = None
+    radius: Tensor | None = None
 
     @cached_property
     def groups(self) -> tf.Groups:
@@ -205,6 +206,7 @@ def seen_cells(state: tf.State, plan: ColonyStatistics, history: Tensor | None) 
         length=length.detach(),
         age=_ages(state, history) if plan.ages else None,
         levels=torch.stack(found, 1) if found else None,
+        radius=state.radius.detach(),
     )
 
 

@@ -6,7 +6,7 @@ and few replicates say of a design, and measures designs per hour.
     python experiments/benchmarks/search.py tasks --methods auto --stop    # minutes
     python experiments/benchmarks/search.py tasks --methods racing bayesian modelled --seeds 2
     python experiments/benchmarks/search.py ranks --tasks "domain size"
-    python experiments/benchmarks/search.py data --methods cmaes bayesian --colonies 400 --seeds 6
+    python experiments/benchmarks/search.py data --methods gauss-newton bayesian --colonies 400
     python experiments/benchmarks/search.py rate
 
 `tasks` runs searches that differ by their seed: random starts and random colonies. Each has 2,000
@@ -31,12 +31,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from fits import FITS
 from record import machine
 from scipy.stats import kendalltau
 from tasks import CELLS, REPLICATES, SHARE, TASKS, UNSEEN, SearchTask
 
 import torchfilm as tf
-from design import CMAES, Bayesian, Local, Objective, Observed, Racing, Search, Sobol, Task
+from design import CMAES, Bayesian, GaussNewton, Local, Objective, Racing, Search, Sobol, Task
 from design.methods.base import sobol_points
 from design.trivial import trivial_losses
 
@@ -50,6 +51,7 @@ METHODS = {
     "racing": lambda: Racing(inner=CMAES(**CLOUD)),
     "bayesian": lambda: Bayesian(batch=6),
     "modelled": lambda: Racing(inner=Bayesian(batch=6)),
+    "gauss-newton": GaussNewton,
     "local": Local,
 }
 
@@ -154,24 +156,19 @@ def ranks(options: argparse.Namespace) -> dict:
 
 
 def data(options: argparse.Namespace) -> dict:
-    """Returns the losses of fits of each method, in 16 colonies that no search saw."""
-    import fit_colony  # in a folder that `tasks` has put on the path
-
-    *_, state = tf.simulate(
-        fit_colony.colony(**fit_colony.TRUTH), colonies=REPLICATES, seed=77, until=3.5
-    )
-    fit = SearchTask(
-        fit_colony.colony,
-        fit_colony.PARAMETERS,
-        Observed.from_state(state, species=("gfp",)),
-        {"until": 3.5, "cells": None},
-    )
-    out: dict = {"colonies": options.colonies}
+    """Returns the losses of fits of each method, in 16 colonies that no search saw, and of the
+    hidden parameters there."""
+    fit, truth = FITS[options.fit]()
+    objective = Objective(fit.task())
+    hidden = objective.task.space.point(truth)
+    found = objective.evaluate(hidden[None], streams=UNSEEN).loss[0]
+    out: dict = {"fit": options.fit, "colonies": options.colonies, "truth": float(found)}
+    print(f"{options.fit}: the hidden parameters have a loss of {found:.2f}", flush=True)
     for method in options.methods:
         seeds = range(options.first, options.first + options.seeds)
         out[method] = [one_search(fit, method, k, options.colonies, 0.0, False) for k in seeds]
         losses = " ".join(f"{r['unseen']:.2f}" for r in out[method])
-        print(f"{method:<8} {options.colonies} colonies, losses {losses}", flush=True)
+        print(f"{method:<12} {options.colonies} colonies, losses {losses}", flush=True)
     return out
 
 
@@ -214,6 +211,7 @@ def main() -> None:
     parser.add_argument(
         "--methods", nargs="*", choices=list(METHODS), default=["auto", "sobol", "cmaes"]
     )
+    parser.add_argument("--fit", choices=list(FITS), default="four", help="of data")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first", type=int, default=1, help="of the seeds")
     parser.add_argument("--colonies", type=int, default=2000)

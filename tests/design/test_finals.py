@@ -8,12 +8,13 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 from searching import lit, mean
 
 import torchfilm as tf
 from design import Finals, Measured, Parameter, Search, Sobol, Study, Target
 from design.entries import Entry
-from design.finals import CHECK_STREAM, FIRST_STREAM, HOLDS, LEAST, is_certain, winner
+from design.finals import CHECK_STREAM, FIRST_STREAM, HOLDS, LEAST, _band, is_certain, winner
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 
@@ -203,6 +204,12 @@ def test_a_band_by_which_a_design_was_chosen_is_told():
     chosen = made.best()
     assert chosen.fresh.chosen and "seeds, which chose it" in chosen.table()
     assert np.array_equal(chosen.point, best.point) and not best.fresh.chosen
+
+
+def test_the_band_of_a_mean_is_that_of_student():
+    losses = np.array([0.1, 0.4, 0.2, 0.7, 0.3])
+    wanted = stats.t.interval(0.9, 4, losses.mean(), losses.std(ddof=1) / np.sqrt(5))
+    assert _band(search().objective.task, losses) == pytest.approx(wanted)
 
 
 @pytest.mark.parametrize("reduce", ["worst", 0.75])

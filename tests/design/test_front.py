@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from patterned import row
 from searching import Level, Spread, built, fragile, grown, lit, mean, objective_of, paced
 
 import torchfilm as tf
@@ -61,6 +62,13 @@ def test_the_front_is_what_no_other_row_exceeds():
     few = spread(goals[rows], 4)
     assert len(few) == 4 and {few[0], few[-1]} == {0, len(rows) - 1}
     assert spread(goals[rows[:2]], 4).tolist() == [0, 1]
+
+
+def test_the_unit_of_a_goal_does_not_change_which_designs_are_spread():
+    share = np.linspace(0.0, 1.0, 40)
+    goals = np.stack([share, (1.0 - share) ** 4], 1)
+    for unit in ([1.0, 1000.0], [1000.0, 1.0]):
+        assert np.array_equal(spread(goals * unit, 6), spread(goals, 6))
 
 
 def test_a_search_with_two_goals_returns_their_front():
@@ -268,6 +276,12 @@ def test_burden_is_the_mean_over_the_volume_of_all_species():
     assert Burden().loss(state).tolist() == pytest.approx(wanted)
     one = Burden(("g1",)).loss(state) + Burden(("g0", "g2")).loss(state)
     assert one.tolist() == pytest.approx(wanted)
+
+
+def test_a_large_cell_is_a_large_part_of_the_burden():
+    """A ball, and a rod of three times its volume."""
+    state = row([0.0, 5.0], length=np.array([0.0, 4 / 3]), g=np.array([0.0, 4.0]))
+    assert float(Burden(("g",)).loss(state)[0]) == pytest.approx(3.0)
 
 
 def test_duration_is_the_time_of_the_end():

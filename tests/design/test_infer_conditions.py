@@ -146,6 +146,12 @@ def test_a_search_fits_the_same_data(data):
     assert best.values["half"] == pytest.approx(1.0, rel=0.3)
 
 
+def test_the_cells_of_a_colony_are_a_mean_over_conditions():
+    ten = Observed.from_table({"length_um": np.linspace(2.0, 4.0, 10)})
+    both = Conditions([({"iptg": dose}, ten) for dose in (0.2, 1.0)])
+    assert cells_each(ObservedConditions(both)) == 10.0
+
+
 # --- measured numbers ----------------------------------------------------------------------------
 
 

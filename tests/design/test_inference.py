@@ -11,13 +11,18 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 from searching import grown
 
 import torchfilm as tf
 from design import Calibration, Choice, Observed, Parameter, Task, infer, neural_posterior
 from design.neural_posterior import NeuralPosterior
 from design.parameters import Space
+from design.posterior import Posterior
 from design.posterior_plot import draw_corner
+from design.prediction import Prediction
+from design.prior import Prior
+from design.region import Region
 from design.simulations import simulate_designs, simulate_points
 
 RATE = [Parameter("rate", 0.8, 2.0, log=True)]
@@ -201,6 +206,48 @@ def test_coverage_of_even_ranks_is_the_level():
     assert "2 truths failed" in made.table()
 
 
+class _Below:
+    """Samples below all truths, with a density that grows with the rate."""
+
+    region = Region.whole(1)
+
+    def sample(self, statistics, count, *, seed):
+        return np.zeros((len(statistics), count, 1))
+
+    def log_density(self, points, statistics):
+        return points[..., 0]
+
+
+def sampled(data, points, prior=None) -> Posterior:
+    """A posterior with these samples, for which nothing was learnt."""
+    task = task_of(data)
+    return Posterior(task, Prior(task.space, prior), None, _Below(), data, points)
+
+
+def test_an_interval_leaves_out_as_much_on_either_side(data):
+    made = sampled(data, np.linspace(0.0, 1.0, 101)[:, None])
+    ends = [RATE[0].value(share) for share in (0.05, 0.95)]
+    assert made.interval(0.9)["rate"] == pytest.approx(ends)
+
+
+def test_ranks_are_numbers_of_samples_below_a_truth_and_of_more_likely_ones(data):
+    found = sampled(data, np.zeros((1, 1))).check(3, samples=9)
+    assert found.ranks.tolist() == [[9]] * 3 and found.density_ranks.tolist() == [0] * 3
+
+
+def test_the_truths_of_a_calibration_follow_the_prior(data, monkeypatch):
+    truths = []
+
+    def simulate(task, points, first):
+        truths.append(points)
+        return simulate_points(task, points, first)
+
+    monkeypatch.setattr("design.posterior.simulate_points", simulate)
+    sampled(data, np.zeros((1, 1)), {"rate": stats.norm(1.4, 0.01)}).check(4, samples=9)
+    rates = [RATE[0].value(float(x)) for x in truths[0][:, 0]]
+    assert rates == pytest.approx([1.4] * 4, abs=0.05)
+
+
 def kinds(kind="fast", copies=1, make=1.0):
     return grown(tf.LogNormal({"slow": 0.8, "fast": 1.8}[kind], 0.2), make * copies)
 
@@ -325,6 +372,16 @@ def test_predictions_look_like_the_data_where_the_model_is_right(data):
     assert float(np.median(seen.losses)) < 0.5 * float(np.median(off.losses))
     assert off.places["log_cells"] == 1.0 and "outside\n" in off.table() + "\n"
     assert np.array_equal(seen.statistics, found.predict(40).statistics)
+
+
+def test_the_loss_and_the_places_of_predictions_by_hand():
+    seen = Observed.from_table({"gfp": [1.0, 2.0]}, species=["gfp"]).without("cells")
+    assert seen.colonies == 1 and len(seen.values) == 2
+    apart = np.array([[0.0, 0.0], [0.0, 3.0]]) * seen.spread
+    made = Prediction(seen, np.zeros((2, 1)), seen.values + apart)
+    assert made.losses == pytest.approx([0.0, 4.5])
+    same = replace(made, statistics=np.tile(seen.values, (2, 1)))
+    assert list(same.places.values()) == [0.5, 0.5]
 
 
 @needs_sbi

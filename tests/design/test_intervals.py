@@ -9,7 +9,7 @@ from scipy.optimize import curve_fit
 
 import torchfilm as tf
 from design import Conditions, Intervals, Measured, ObservedCourse, OnFraction, Parameter, Search
-from design.intervals import intervals_of
+from design.intervals import _above, intervals_of
 
 ONE = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]])
 TIMES = np.arange(1, 9) * 0.5
@@ -68,6 +68,12 @@ def test_a_fit_above_its_minimum_is_told():
     off = intervals_of(search.objective, point, values, loss)
     assert off.above == pytest.approx(loss - best.loss, rel=0.1)
     assert f"some {off.above:.2g} above the minimum near it. Search longer." in off.table()
+
+
+@pytest.mark.parametrize("bound, outward", [(0.0, 1.0), (1.0, -1.0)])
+def test_a_bound_stops_a_way_down_beyond_it(bound, outward):
+    of = lambda slope: _above(np.array([bound]), np.array([slope]), np.eye(1))
+    assert of(outward) == 0.0 and of(-outward) == 0.5
 
 
 @pytest.mark.parametrize("conditions", [False, True])

@@ -12,6 +12,7 @@ from asking import SPACES, Room, begun, ellipsoid, evaluate, follow, sphere
 
 from design.methods import CMAES, Bayesian, Racing, Sobol
 from design.methods.base import sobol_points
+from design.methods.bayesian import tamed
 from torchfilm.tools.checks import InputError
 
 # Sobol
@@ -247,6 +248,10 @@ def test_a_new_cloud_trusts_small_colonies_again():
 
 
 # Bayesian
+
+
+def test_losses_far_above_the_median_are_limited():
+    assert tamed(np.array([0.0, 1.0, 100.0])).tolist() == [0.0, 1.0, 3.0]
 
 
 def test_without_botorch_the_error_names_the_extra(monkeypatch):

@@ -54,6 +54,14 @@ def test_a_design_that_the_scene_refuses_fails_alone(most):
     assert made.colonies(points[0]) == []
 
 
+def test_a_colony_with_less_than_half_of_its_cells_has_failed():
+    """Its target would score a single cell."""
+    made = objective_of(lit, [Parameter("make", 1, 2)], Level(), cells=20, until=1.0, replicates=1)
+    found = made.evaluate(np.array([[0.5]]))
+    assert found.loss[0] == Level.failed and 1 < found.cells[0, 0] < 10
+    assert "and 10, half of 20, are needed" in found.reasons[0, 0]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("replay", [True, False])
 def test_rates_that_are_not_finite_fail_with_time_and_cell(replay):

@@ -142,13 +142,15 @@ def test_relative_levels_do_not_depend_on_their_unit(seen):
     assert target.loss(bright).tolist() == pytest.approx(target.loss(state).tolist(), rel=1e-4)
 
 
-def test_results_give_ages(tmp_path, seen):
+@pytest.mark.parametrize("caps", [False, True])
+def test_results_give_ages_and_lengths(tmp_path, seen, caps):
     state, history = seen
     path = tmp_path / "run.h5"
     for _ in tf.simulate(colony(), until=2.5, colonies=4, seed=3, record=path):
         pass
-    read = Observed.from_results(path, species=["gfp"])
-    made = Observed.from_state(state, species=["gfp"], history=history)
+    options = {"species": ["gfp"], "length_with_caps": caps}
+    read = Observed.from_results(path, **options)
+    made = Observed.from_state(state, history=history, **options)
     assert read.plan.names == made.plan.names and read.time == pytest.approx(2.5)
     assert read.values == pytest.approx(made.values, rel=1e-5)
 
@@ -181,6 +183,24 @@ def test_the_spread_of_one_colony_is_bootstrapped():
     few = Observed.from_table({"length_um": lengths[:50]})
     assert few.spread[k] == pytest.approx(math.sqrt(math.pi / 100), rel=0.5)
     assert few.spread[0] == pytest.approx(1 / math.sqrt(50))
+
+
+def test_three_colonies_are_enough_for_the_spread_between_them():
+    table = {"gfp": [1.0, 1.0, 2.0, 2.0, 4.0, 4.0], "colony": [0, 0, 1, 1, 2, 2]}
+    target = Observed.from_table(table, species=["gfp"])
+    k = target.plan.names.index("gfp_mean")
+    assert target.spread[k] == pytest.approx(np.std([1.0, 2.0, 4.0], ddof=1))
+
+
+@pytest.mark.parametrize("cells, least", [(1000, 0.02), (5, 0.5 / 5)])
+def test_colonies_with_as_many_cells_have_a_spread_of_their_number(cells, least):
+    table = {"length_um": np.full(3 * cells, 2.0), "colony": np.repeat([0, 1, 2], cells)}
+    assert Observed.from_table(table).spread[0] == pytest.approx(least)
+
+
+def test_cells_that_are_all_alike_have_a_spread_of_their_variation():
+    target = Observed.from_table({"gfp": [2.0] * 5}, species=["gfp"])
+    assert target.spread[target.plan.names.index("gfp_cv")] == pytest.approx(0.01)
 
 
 def test_dark_cells_have_a_spread():

@@ -69,6 +69,25 @@ def test_the_loss_is_that_of_all_statistics(course):
     assert course.loss(state, history).tolist() == pytest.approx(wanted.tolist(), rel=1e-12)
 
 
+def test_the_residuals_are_those_of_the_frames_that_were_reached(course):
+    states = list(tf.simulate(colony(1.3), until=1.0, dt=0.1, colonies=2, seed=9))
+    found = course.residuals(states[-1], torch.stack([course.note(s) for s in states]))
+    wanted = course.frames[0].loss(states[-1])
+    assert found.square().sum(1).tolist() == pytest.approx(wanted.tolist())
+
+
+def test_cells_were_observed_with_an_error_of_their_number(course):
+    cells = math.exp(course.values[0])
+    wanted = (cells, cells * course.spread[0])
+    assert course.evidence["cells at 1 h"] == pytest.approx(wanted)
+
+
+def test_times_that_differ_from_cell_to_cell_are_warned_of():
+    table = {"time_h": [1.0, 1.0, 1.1, 1.2, 1.3, 1.4], "length_um": [2.0] * 6}
+    with pytest.warns(UserWarning, match="5 times in 6 rows.*round those"):
+        ObservedCourse.from_table(table)
+
+
 def test_a_colony_that_was_not_seen_has_no_statistics(course):
     states = list(tf.simulate(colony(), until=2.0, dt=0.1, colonies=2, seed=8))
     late = torch.stack([course.note(s) for s in states[15:]])

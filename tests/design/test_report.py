@@ -12,7 +12,7 @@ import matplotlib.text
 import numpy as np
 import pytest
 import torch
-from patterned import crowded
+from patterned import crowded, row
 from searching import Level, Spread, banned, built, fragile, lit, uneven
 
 import torchfilm as tf
@@ -34,7 +34,7 @@ from design import (
 from design.finals import FreshLosses
 from design.report import table
 from design.report_plot import draw
-from design.trivial import trivial_losses
+from design.trivial import BRIGHT, LEVELS, trivial_losses
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 
@@ -407,6 +407,13 @@ def test_trivial_answers_are_those_of_the_target():
     assert found["all lit"] == pytest.approx(np.mean(lit_losses))
     assert found["best even level"] == pytest.approx(found["all lit"]) and found["all dark"] == 1.0
     assert found["every second lit"] > found["all lit"]
+
+
+def test_the_best_even_level_is_that_of_the_least_loss():
+    finished = SimpleNamespace(state=row([0.0, 3.0], gfp=1.0), history=None)
+    levels = np.geomspace(1e-6, 1.0, LEVELS) * BRIGHT
+    found = trivial_losses(Level(wanted=1.5), [finished])["best even level"]
+    assert found == pytest.approx(np.abs(levels - 1.5).min()) and found < 0.5
 
 
 def test_numbers_on_a_bound_are_marked():

@@ -15,7 +15,7 @@ from searching import Level, built, fragile, lit, mean, objective_of
 
 import torchfilm as tf
 from design import Best, Choice, Parameter, Search, Target, check_robustness
-from design.variation import _variants
+from design.variation import _variants, varied
 
 MAKE = Parameter("make", 0.1, 10, log=True)
 
@@ -380,6 +380,13 @@ def test_all_parameters_vary_at_once_within_their_bounds(spare, tmp_path):
     assert saved["varied"]["losses"] == varied.losses.tolist()
     found.plot(tmp_path / "held.png")
     assert check_robustness(spare, seeds=2, sizes=(), progress=False).varied is None
+
+
+def test_variants_are_grown_on_four_seeds_in_turn(spare):
+    found = varied(spare.objective, spare.point, 0.3, range(2, 8), None, 1)
+    for k, seed in enumerate([2, 3, 4, 5, 2, 3]):
+        alone = spare.objective.evaluate(found.points[k : k + 1], streams=(seed,))
+        assert found.losses[k] == alone.losses[0, 0]
 
 
 def test_choices_and_whole_numbers_do_not_vary():

@@ -13,7 +13,7 @@ import scipy.stats
 import torchfilm as tf
 from design import Choice, Measured, Parameter, infer
 from design.inference import LEAST
-from design.neural_posterior import NeuralPosterior, _compressed
+from design.neural_posterior import WIDE, NeuralPosterior, _compressed
 from design.parameters import Space
 from design.prior import Prior
 from design.region import BEYOND, MARGIN, Region
@@ -89,6 +89,14 @@ def test_designs_of_a_region_follow_the_prior_within_it():
     for k in (0, 1):
         assert scipy.stats.ks_2samp(found[1000:, k], within[:, k]).pvalue > 1e-3
     assert (found[1000:, 2] >= 0.5).mean() == pytest.approx(0.8, abs=0.03)
+
+
+def test_each_round_has_draws_of_its_own():
+    prior = Prior(Space([Parameter("a", 0.0, 1.0), Parameter("b", 1.0, 10.0, log=True)]))
+    draws = np.random.default_rng(0).random((20, 2))
+    region = Region(np.array([0.2, 0.4]), np.array([0.6, 0.5]), 12)
+    found = _points(prior, draws, [Region.whole(2), region])
+    assert region.widen(found[12:]) == pytest.approx(draws[12:])
 
 
 @needs_sbi
@@ -193,3 +201,14 @@ def test_statistics_that_vary_far_more_than_their_errors_are_compressed():
     x = np.array([[-40.0, 3.0], [0.1, 3.0]])
     found = _compressed(x, np.array([0.1, np.inf]))
     assert found == pytest.approx(np.array([[np.arcsinh(-400.0), 3.0], [np.arcsinh(1.0), 3.0]]))
+
+
+@needs_sbi
+def test_only_statistics_that_vary_far_more_than_their_errors_have_a_unit(monkeypatch):
+    monkeypatch.setattr("design.neural_posterior._learn_flows", lambda *about: ())
+    points = np.linspace(0.1, 0.9, 9)[:, None]
+    unit = points.std() / np.array([WIDE + 1.0, WIDE - 1.0])
+    learnt = NeuralPosterior.learn(
+        points, np.c_[points, points], unit=unit, seed=0, flows=1, epochs=1
+    )
+    assert learnt.unit.tolist() == [unit[0], np.inf]

@@ -135,3 +135,16 @@ def test_of_two_targets_the_one_whose_measure_is_shown_explains_it():
     both = Weighted([(Stripe("g", at=0.0, width=9.0), 1.0), (RING, 1.0)])
     assert both.why_undefined("contrast") == RING.why_undefined("contrast")
     assert both.why_undefined("peak") and not Level().why_undefined("mean_level")
+
+
+def test_a_constraint_on_an_undefined_measure_is_broken():
+    target, state, *_ = UNDEFINED["under constraints"]
+    assert target.loss(state()).tolist() == [Constrained.BROKEN + 1.0]
+
+
+@pytest.mark.filterwarnings("ignore:.*empty. the cells are of")
+def test_a_colony_without_a_loss_has_failed_and_broken_no_constraint():
+    lit_cells = OnFraction("g", 0.5, level=2.0)
+    target = Constrained(Burden(("g",)), (lit_cells,), at_least={"on_share": 0.9})
+    loss = target.loss(empty())
+    assert loss[0] > Constrained.BROKEN and loss[1].isnan()

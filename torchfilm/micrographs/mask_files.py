@@ -16,6 +16,7 @@ EXTRA = f"Images require scikit-image and tifffile: {checks.install('images')}."
 NOT_IMAGES = {
     ".mat": "Read it by scipy.io.loadmat, and give the array of labels (SuperSegger:"
     ' loadmat(file, simplify_cells=True)["regs"]["regs_label"]).',
+    ".h5": 'Read it by h5py, and give the array of labels (ilastik: file["exported_data"][0]).',
     ".pkl": "Give a label image.",
     ".csv": "For a table, use Cells.from_table.",
 }

@@ -1,0 +1,79 @@
+"""What data take from observed cells: values of statistics, their spreads, and the width."""
+
+from __future__ import annotations
+
+import torch
+
+import torchfilm as tf
+from design.targets.statistics import LOG_CELLS, ColonyStatistics, SeenCells, resampled_spread
+from torchfilm import checks
+
+ENOUGH = 3  # colonies from which on the spread between them is measured
+FINEST = 0.01  # the least spread, relative to the greatest statistic of its group
+# The least spread of the logarithm of a number of cells; and of the number itself, which is whole.
+COUNT, PART = 0.02, 0.5
+VARIED = 0.01  # the least spread of a coefficient of variation
+OTHER_WIDTH = 0.15  # share by which cells of a scene are wider or narrower, from which it is said
+SURE = 2.0  # standard errors by which the mean of a reporter is above 0, to divide by it
+
+
+@torch.no_grad()
+def values_of(
+    cells: SeenCells, plan: ColonyStatistics
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """The mean of each statistic over the colonies, (K,), and its spread."""
+    each = plan.of(cells)
+    count = len(cells.counts)
+    resampled = [resampled_spread(cells, plan, k) for k in range(count)]
+    spread = torch.stack(resampled).square().mean(0).sqrt()
+    if count >= ENOUGH:
+        between = each.std(0)
+        # of few colonies it is small by chance, and it contains that of drawing cells; but
+        # divisions in step make numbers of cells more alike than independent ones would
+        at = plan.names.index(LOG_CELLS) if LOG_CELLS in plan.names else None
+        spread = torch.maximum(spread, between)
+        if at is not None:
+            spread[at] = between[at]
+    least = torch.cat([
+        each[:, [plan.names.index(n) for n in names]].abs().max().mul(FINEST).expand(len(names))
+        for names in plan.groups.values()
+    ])  # fmt: skip
+    if plan.names[0] == LOG_CELLS:
+        least[0] = max(COUNT, PART / float(cells.counts.double().mean()))
+    alike = torch.tensor([VARIED if n.endswith("_cv") else 0.0 for n in plan.names])
+    least = torch.maximum(least, alike.to(least))
+    spread = torch.maximum(spread, least)
+    spread = torch.where(spread > 0, spread, 1.0)  # a reporter that is dark in all cells
+    return tuple(each.mean(0).tolist()), tuple(spread.tolist())
+
+
+def check_relative(cells: SeenCells, plan: ColonyStatistics) -> None:
+    """Raise InputError for levels that count relative to a mean which is not above 0; where some
+    are below, as those of dark cells less their background, by more than its error."""
+    if not plan.relative or cells.levels is None:
+        return
+    for k, name in enumerate(plan.species):
+        for colony, level in enumerate(cells.levels[:, k].double().split(cells.counts.tolist())):
+            mean, count = float(level.mean()), len(level)
+            error = float(level.std()) / count**0.5 if count > 1 else 0.0
+            if mean <= (SURE * error if bool((level < 0).any()) else 0.0):
+                raise checks.input_error(
+                    f"the mean of {name} in colony {colony}",
+                    f"{mean:.3g} ± {error:.2g}",
+                    "above 0 by two standard errors, as relative=True divides by it",
+                    "Subtract less of a background, leave the reporter out, or compare it in units"
+                    " with relative=False.",
+                )
+
+
+def warn_of_width(width: float | None, state: tf.State) -> None:
+    """Warn of a first state whose cells are wider or narrower than the observed ones."""
+    if width is None or not state.cells:
+        return
+    here = 2.0 * float(state.radius.double().mean())
+    if abs(here / width - 1.0) > OTHER_WIDTH:
+        checks.warn(
+            f"the observed cells are {width:.2f} µm wide, and those of the scene {here:.2f} µm:"
+            " they have other volumes, and pack otherwise. Give the scene founders of that width:"
+            f" tf.Cells.single(…, radius={width / 2:.2f})."
+        )
