@@ -203,7 +203,7 @@ class Objective(metaclass=checks.KnownKeywords):
                 gathered.put([row * count + k for row in rows for k in range(count)], found.slopes)
         shares = task.shares(losses)
         slopes = None if tangents is None else gathered.reduced(shares)
-        mean = None if apart is None else (shares[:, :, None] * apart).sum(1)
+        mean = None if apart is None else _shared(shares, apart)
         copies = task.conditions * (1 if tangents is None else len(tangents[0]))
         return Evaluation(
             points, values, losses, task.reduced(losses), cells, reasons, size, why_regrown, 0.0,
@@ -239,3 +239,10 @@ class Objective(metaclass=checks.KnownKeywords):
         fail are left out."""
         values = self.task.space.values(np.asarray(point))
         return finished_colonies(self.task, values, self.task.streams(streams))
+
+
+def _shared(shares: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+    """The residuals (n, K) of designs, from those of their replicates (n, R, K) that have a share
+    in the loss, (n, R)."""
+    each = shares[:, :, None]
+    return np.where(each > 0, each * residuals, 0.0).sum(1)

@@ -228,11 +228,6 @@ class Space(metaclass=checks.KnownKeywords):
         """The dimensions without levels, by which losses have derivatives."""
         return [k for k, levels in enumerate(self.levels) if levels is None]
 
-    @property
-    def has_choices(self) -> bool:
-        """Whether some of the dimensions have no order."""
-        return any(isinstance(p, Choice) for p in self.parameters)
-
     def values(self, point: np.ndarray) -> dict[str, Value]:
         """The values of one design by name, from its coordinates (D,)."""
         wanted = f"{self.size} coordinates in [0, 1]"

@@ -36,7 +36,8 @@ def to_data(value: Any) -> Any:
         if all(isinstance(name, str) for name in value):
             return {name: to_data(entry) for name, entry in value.items()}
         # JSON has texts for names, and these are numbers, such as cell types
-        return {PAIRS: [[to_data(name), to_data(entry)] for name, entry in value.items()]}
+        pairs = [[to_data(name), to_data(entry)] for name, entry in value.items()]
+        return {KIND: PAIRS, PAIRS: pairs}
     if KINDS.get(type(value).__name__) is not type(value) or not dataclasses.is_dataclass(value):
         raise NotPlain(type(value).__name__)
     own = {f.name: to_data(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
@@ -51,13 +52,21 @@ def from_data(data: Any) -> Any:
     if not isinstance(data, Mapping):
         return data
     found = {name: from_data(entry) for name, entry in data.items()}
-    if set(found) == {PAIRS}:
-        return dict(found[PAIRS])
     if KIND not in found:
         return found
     kind = found.pop(KIND)
+    if kind == PAIRS:
+        return _of_pairs(found)
     checks.choice(KIND, kind, tuple(KINDS))
     try:
         return KINDS[kind](**found)
     except TypeError as error:
         raise checks.InputError(f"no {kind} can be made of {found} ({error}).") from error
+
+
+def _of_pairs(found: Mapping[str, Any]) -> dict[Any, Any]:
+    """A dictionary with other names than texts."""
+    try:
+        return dict(found[PAIRS])
+    except (KeyError, TypeError, ValueError) as error:
+        raise checks.InputError(f"no pairs of a name and a value: {dict(found)}.") from error

@@ -260,9 +260,9 @@ class Posterior:
         found = simulate_points(self.task, self.points[rows], _first(self.task, PREDICTED))
         _check_some(found)
         sound = found.sound
-        return Prediction(
-            self.observed, found.points[sound], found.statistics[sound], int((~sound).sum())
-        )
+        failed, replicates = int((~sound).sum()), self.task.replicates
+        kept = found.points[sound], found.statistics[sound]
+        return Prediction(self.observed, *kept, failed, replicates)
 
     @property
     def correlations(self) -> dict[tuple[str, str], float]:

@@ -30,22 +30,24 @@ class Prediction:
 
     observed: the data. points: the parameters, (n, D) coordinates in [0, 1]. statistics: (n, K) by
     `observed.plan.names`, means over the replicates of the inference. failed: simulations that
-    failed, and are not among the n.
+    failed, and are not among the n. replicates: of each; None is as many as were observed.
     """
 
     observed: Observed
     points: np.ndarray
     statistics: np.ndarray
     failed: int = 0
+    replicates: int | None = None
 
     @property
     def losses(self) -> np.ndarray:
         """Of each simulation the mean of ((statistic − value)/error)², (n,), with the standard
-        errors of the values: their spreads, by the root of the number of colonies. Where the model
-        is right and the posterior narrow, it is about 2, since data and simulation both scatter; it
-        is more where fewer than three colonies were observed, whose spread is underrated."""
+        errors of means over colonies: their spreads, by the root of the number of colonies. Where
+        the model is right and the posterior narrow, it is about 2, since data and simulation both
+        scatter; it is more where fewer than three colonies were observed, whose spread is
+        underrated."""
         apart = self.statistics - np.array(self.observed.values)
-        return np.square(apart / standard_errors(self.observed)).mean(1)
+        return np.square(apart / standard_errors(self.observed, self.replicates)).mean(1)
 
     @property
     def places(self) -> dict[str, float]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -88,10 +87,9 @@ class Proposal:
                 know(self.entry.points, found)
             return
         batch = replace(self.batch, points=self.entry.points)
-        more: dict[str, Any] = {"slopes": self.entry.slopes} if batch.slopes else {}
-        if batch.residuals:
-            more["residuals"] = self.entry.residuals
-        method.tell(batch, found, **more)
+        slopes = (self.entry.slopes,) if batch.slopes else ()
+        more = {"residuals": self.entry.residuals} if batch.residuals else {}
+        method.tell(batch, found, *slopes, **more)
 
 
 def repeat_study(

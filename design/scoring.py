@@ -333,8 +333,12 @@ def _scores(target: Target, finished: FinishedColonies) -> np.ndarray:
 
 def _residuals(target: Target, finished: FinishedColonies) -> np.ndarray:
     """The residuals of finished colonies, (B, K)."""
-    found = target.residuals(finished.state, finished.history)
-    assert found is not None  # a comparable target has some
+    found, count = target.residuals(finished.state, finished.history), finished.state.colonies
+    if not isinstance(found, torch.Tensor) or found.dim() != 2 or len(found) != count:
+        raise TypeError(
+            f"{type(target).__name__}.residuals must return a tensor of shape ({count}, K), since"
+            " the target is comparable"
+        )
     return found.double().cpu().numpy()
 
 

@@ -59,17 +59,17 @@ class Search(TaskOptions):
         )
         best = search.run(colonies=2000, study="stripe.h5")
 
-    method: "cmaes", "sobol", "racing", "bayesian", "local", "polish", "exhaustive", for several
-    goals "nsga2", one of their objects with settings of its own, or any object with start, ask and
-    tell (`Method`); "auto" chooses, and `best.table()` says why. finals: how the best designs are
-    tested on fresh seeds; None leaves this out. start: designs from which the search starts: their
-    values by name, a `Best`, the file of a saved design, or a `Study` or its file. A study of the
-    same task with other bounds, or without some of the parameters, keeps its losses; of any other
-    designs the best are grown again; `run` prints which are left out, and why. method_seed: of what
-    the method draws, by default `seed`, which the colonies have; to compare methods on the same
-    colonies. `TaskOptions` documents the other arguments; `search.objective.task` holds them
-    checked. Raises the errors of `Task`, and InputError for a method, finals or a start that are
-    not allowed.
+    method: "cmaes", "sobol", "racing", "bayesian", "local", "polish", "gauss-newton", "exhaustive",
+    for several goals "nsga2", one of their objects with settings of its own, or any object with
+    start, ask and tell (`Method`); "auto" chooses, and `best.table()` says why. finals: how the
+    best designs are tested on fresh seeds; None leaves this out. start: designs from which the
+    search starts: their values by name, a `Best`, the file of a saved design, or a `Study` or its
+    file. A study of the same task with other bounds, or without some of the parameters, keeps its
+    losses; of any other designs the best are grown again; `run` prints which are left out, and why.
+    method_seed: of what the method draws, by default `seed`, which the colonies have; to compare
+    methods on the same colonies. `TaskOptions` documents the other arguments;
+    `search.objective.task` holds them checked. Raises the errors of `Task`, and InputError for a
+    method, finals or a start that are not allowed.
     """
 
     method: str | Method = field(default="auto", kw_only=True)
@@ -351,7 +351,7 @@ class Search(TaskOptions):
             # where choices are resolved, several designs are one
             math.inf if task.space.digest else designs_of(task.space),
             (colonies - self._reserved(colonies)) / task.colonies_each,
-            task.target.comparable and not task.space.has_choices,
+            task.target.comparable and len(task.space.moving) == task.space.size,
         )
         told = task.tried.stochastic or isinstance(chosen.method, Exhaustive) or before
         why = "" if told else self.objective.why_no_squares

@@ -46,10 +46,10 @@ CASES = {
 }
 
 
-def known(kind: type) -> set[int]:
-    """The objects of a kind that there are: other tests may have left some."""
+def left(kind: type) -> int:
+    """How many objects of a kind there are."""
     gc.collect()
-    return {id(x) for x in gc.get_objects() if type(x) is kind}
+    return sum(type(x) is kind for x in gc.get_objects())
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -68,23 +68,23 @@ def test_gradients_whatever_the_segment(case):
     assert torch.equal(slopes[1], slopes[2]) and abs(float(slopes[0])) > 1e-3
 
 
+@pytest.mark.usefixtures("new_objects")
 def test_no_contact_problem_is_kept():
     x, counts = torch.tensor(0.8, dtype=F64, requires_grad=True), []
-    others = known(_AdjointSolve)
     for segment in (None, 4):
         model = pushing(x).bind(dtype=F64)
         end = tf.rollout(model, until=0.4, segment=segment)
-        counts.append(len(known(_AdjointSolve) - others))
+        counts.append(left(_AdjointSolve))
         end.position.sum().backward()
-        counts.append(len(known(_AdjointSolve) - others))
+        counts.append(left(_AdjointSolve))
         del end, model
     assert counts[0] >= 8 and counts[2:] == [0, 0]
 
 
+@pytest.mark.usefixtures("new_objects")
 @pytest.mark.parametrize("case", ["exchange", "solved"])
 def test_nothing_is_kept_after_a_gradient_that_does_not_reach_all(case):
     """That of lengths does not need exchange, which was done again for it all the same."""
-    others = known(Segment)
     for k in range(3):
         rate = torch.tensor(0.3, dtype=F64, requires_grad=True)
         scene = CASES[case][0](1.0)
@@ -92,12 +92,11 @@ def test_nothing_is_kept_after_a_gradient_that_does_not_reach_all(case):
         end = tf.rollout(scene.bind(dtype=F64), until=0.4, segment=4)
         for _ in range(2):
             torch.autograd.grad(end.length.sum(), rate, retain_graph=True)
-        found = (x for x in gc.get_objects() if type(x) is Segment)
-        segments = [x for x in found if id(x) not in others]
+        segments = [x for x in gc.get_objects() if type(x) is Segment]
         assert segments and not any(x._things for x in segments)
         (end.a.sum() + end.length.sum()).backward()
-        del end, scene, segments, found
-        assert known(Segment) <= others, k
+        del end, scene, segments
+        assert not left(Segment), k
 
 
 class Doubled(torch.autograd.Function):

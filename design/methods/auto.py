@@ -71,7 +71,7 @@ def choose(
     with exact derivatives; chance: whether molecules are counted one by one; replicates: of a
     design; before: what the study of a search that is resumed says of its method, which goes on;
     different: designs in the space; searched: those that the budget grows before the finals;
-    comparable: whether there are residuals that compare between colonies, and no choices."""
+    comparable: whether there are residuals that compare between colonies, and no levels."""
     botorch = find_spec("botorch") is not None
     alone = chance or not pattern  # the model draws all designs
     most, least = MODELLED if alone else RACED, LEAST_RACED if pattern else 0

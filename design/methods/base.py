@@ -68,9 +68,9 @@ class Batch:
 
 class Method(Protocol):
     """How a search chooses points. Any object with these three functions can be the method of a
-    search. `tell` gets `slopes=` or `residuals=`, too, where the batch asked for them: `Slopes`, or
-    numbers (n, K) whose squares add up to the loss but for the scatter between replicates, NaN for
-    a design that failed, None where all did.
+    search. `tell` gets a third argument, `Slopes`, where the batch asked for them, and `residuals=`
+    where it asked for these: numbers (n, K) whose squares add up to the loss but for the scatter
+    between replicates, NaN for a design that failed; None where all did.
 
     The result of `ask` must depend only on the arguments of `start`, the method's settings, and all
     calls of `tell`: a new method resumes a stopped search from the batches and losses of its study.

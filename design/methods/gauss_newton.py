@@ -22,10 +22,11 @@ BATCH, LEAST_BATCH = 0.4, 4
 # another valley: it is left sooner.
 FIRST, WIDEST, LEAST = 0.3, 0.5, 0.03
 WIDER, NARROWER = 1.3, 0.85
-FAR_OFF, HASTY = 5.0, 0.6
+FAR_OFF, HASTY = 5.0, 0.75
 GAIN = 1e-3  # share of the loss that a batch must gain, for the box to widen
 BROAD = 0.5  # standard deviation of a coordinate of which the data say nothing
 DAMPING = 0.1  # of a step, as a share of 1 / BROAD: for combinations of which they say nothing
+TRIES = 20  # for a design that was not grown, where there are levels
 NOTHING = 1e-9  # a loss below which all designs are alike
 RIDGE = 1e-4  # of a regression, as a share of its weights
 
@@ -47,7 +48,7 @@ class GaussNewton(AskTell):
     Such slopes see through scatter and small steps, which derivatives do not, and need no colonies
     of their own. After Cartis and Roberts (Math. Program. Comput. 11, 631, 2019), whose method is
     for one design at a time. A dimension with levels is rounded to these, so it should have an
-    order.
+    order; a design that was grown already is one at random in its place.
     """
 
     squares = True  # needs the residuals of data
@@ -91,9 +92,23 @@ class GaussNewton(AskTell):
     def _next(self) -> Batch:
         space = self._started()
         if not self._is_opening:
-            return Batch(snap(self._propose(), space.levels), residuals=True)
+            return Batch(self._fresh(snap(self._propose(), space.levels)), residuals=True)
         fresh = sobol_points(space, self._seed, self._drawn, self._opening)
         return Batch(np.concatenate([self._known, fresh]), residuals=True)
+
+    def _fresh(self, points: np.ndarray) -> np.ndarray:
+        """The points, with others at random in place of those that were grown: rounded to levels,
+        they may be, and would tell nothing new."""
+        space = self._started()
+        grown = {p.tobytes() for p in self._points}
+        rng = np.random.default_rng([self._seed, self._batches, 1])
+        for row in range(len(points)):
+            for _ in range(TRIES):
+                if points[row].tobytes() not in grown:
+                    break
+                points[row] = snap(rng.random((1, space.size)), space.levels)[0]
+            grown.add(points[row].tobytes())
+        return points
 
     def _propose(self) -> np.ndarray:
         """Where the lines of the residuals have their least squares, and designs about it, (n,

@@ -65,7 +65,8 @@ class Measured(Target):
     extinct: bool = False
     smooth: bool = False
     time: float | None = None
-    colonies: int = 1
+    # without effect on losses: studies do not depend on it
+    colonies: int = field(default=1, repr=False)
     _warned: bool = field(default=False, init=False, repr=False, compare=False)
 
     @property

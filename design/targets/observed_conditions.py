@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -133,17 +132,14 @@ def grown(observed: Observed) -> Target:
     return observed.conditions if isinstance(observed, ObservedConditions) else observed
 
 
-def standard_errors(observed: Observed) -> np.ndarray:
+def standard_errors(observed: Observed, replicates: int | None = None) -> np.ndarray:
     """Of the values, (K,): the spread of cells is that of single colonies, and each value a mean
-    over some; that of measured numbers is their error."""
-    if isinstance(observed, ObservedConditions):
-        parts: tuple[Any, ...] = observed.conditions.parts
-    elif isinstance(observed, ObservedCourse):
-        parts = observed.frames
-    else:
-        own = 1 if isinstance(observed, ObservedMeasures) else observed.colonies
-        return np.array(observed.spread) / math.sqrt(own)
-    return np.concatenate([standard_errors(part) for part in parts])
+    over some; that of measured numbers is their error. replicates: of a simulation, for the root of
+    half the squares of its error and that of the value."""
+    spread, seen = np.array(observed.spread), np.array(_colonies(observed))
+    alone = np.array([error > 0 for error in errors(observed)])  # which simulations have, too
+    grown = seen if replicates is None else np.array(averaged(observed, replicates))
+    return np.where(alone, spread, spread * np.sqrt(0.5 / seen + 0.5 / grown))
 
 
 def averaged(observed: Observed, replicates: int) -> list[int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from design.targets.observed_frames import (
     state_frames,
 )
 from design.targets.observed_measures import MeasureStatistics, ObservedMeasures, as_data
+from design.targets.observed_values import warn_of_width
 from design.targets.statistics import LOG_CELLS, ColonyStatistics, birth_note
 from torchfilm import checks, tables
 
@@ -103,9 +104,10 @@ class ObservedCourse(Observed):
         """Frames of colonies that end at the last one, or later, at `end` h."""
         times = tuple(float(f.time or 0.0) for f in given)
         end = times[-1] if end is None else end
+        widths = [f.width for f in given if f.width is not None]
         kept = tuple(
             f.without("age") if f.plan.ages and time < end else f
-            for f, time in zip(given, times, strict=True)
+            for f, time in zip(map(_without_width, given), times, strict=True)
         )
         found = {
             "frames": kept,
@@ -115,6 +117,7 @@ class ObservedCourse(Observed):
             "colonies": max(f.colonies for f in kept),
             "cells": sum(f.cells for f in kept),
             "time": end,
+            "width": sum(widths) / len(widths) if widths else None,
         }
         for name, value in found.items():
             object.__setattr__(self, name, value)
@@ -185,18 +188,21 @@ class ObservedCourse(Observed):
         spread: Mapping[str, Any],
         extinct: bool = False,
         smooth: bool = False,
+        colonies: int = 1,
     ) -> ObservedCourse:
         """Measures of your own at several times, such as those of a plate reader:
 
             ObservedCourse.of_measures({"od": volume}, times=(1, 2, 3),
                                        values={"od": (0.1, 0.2, nan)}, spread={"od": 0.01})
 
-        functions, extinct, smooth: as of `Measured`. times: h, in their order. values: by name, as
-        many numbers as times, NaN where one is missing; a pandas.DataFrame will do. spread: by
-        name, a standard error above 0, or one for each time. Raises InputError for other names,
-        lengths or times, and where fewer than two times have a value.
+        functions, extinct, smooth, colonies: as of `Measured`. times: h, in their order. values: by
+        name, as many numbers as times, NaN where one is missing; a pandas.DataFrame will do.
+        spread: by name, a standard error above 0, or one for each time. Raises InputError for other
+        names, lengths or times, and where fewer than two times have a value.
         """
-        return ObservedCourse(measured_frames(functions, times, values, spread, extinct, smooth))
+        return ObservedCourse(
+            measured_frames(functions, times, values, spread, extinct, smooth, colonies)
+        )
 
     @staticmethod
     @checks.known_keywords
@@ -256,14 +262,16 @@ class ObservedCourse(Observed):
     def check(self, state: tf.State) -> None:
         for frame in self.frames:
             frame.check(state)
+        warn_of_width(self.width, state)
 
     @property
     def fewest(self) -> int:  # type: ignore[override]
         return max(frame.fewest for frame in self.frames)
 
     def unfit(self, state: tf.State) -> list[str]:
-        each = (frame.unfit(state) for frame in self._last)
-        return next(each, [ended_elsewhere(state, self.time)] * state.colonies)
+        ended = [ended_elsewhere(state, self.time)] * state.colonies
+        each = [frame.unfit(state) for frame in self._last] or [ended]
+        return [next(filter(None, why), "") for why in zip(*each, strict=True)]
 
     def why_rough(self, state: tf.State) -> str:
         return next(filter(None, (frame.why_rough(state) for frame in self.frames)), "")
@@ -368,6 +376,11 @@ def _course(frames: tuple[Observed, ...], end: float | None) -> ObservedCourse:
     return made
 
 
+def _without_width(frame: Observed) -> Observed:
+    """The frame without its width, of which the course warns once."""
+    return frame if frame.width is None else replace(frame, width=None)
+
+
 def _plain(name: str) -> str:
     """The name of the number of cells itself, in place of its logarithm."""
     return "cells" + name.removeprefix(LOG_CELLS) if name.startswith(LOG_CELLS) else name
@@ -387,12 +400,21 @@ def _checked(frames: object) -> tuple[Observed, ...]:
                 f"ObservedCourse.frames[{k}].time", None, "the time of the frame, h",
                 "Give time=… where you read it.",
             )  # fmt: skip
-        same = k and frame.time == found[-1].time and type(frame) is not type(found[-1])
-        if k and frame.time <= (found[-1].time or 0.0) and not same:
+        there = [f for f in found if f.time == frame.time]
+        beside = len(there) == 1 and type(frame) is not type(there[0])
+        if k and frame.time <= (found[-1].time or 0.0) and not beside:
             raise checks.input_error(
                 f"ObservedCourse.frames[{k}].time", frame.time,
                 f"above that of the frame before, {found[-1].time:g} h",
                 "An Observed and a Measured may have one time.",
             )  # fmt: skip
+        if beside and (both := {*_measures(frame)} & {*_measures(there[0])}):
+            rule = f"of other names than the Observed of {frame.time:g} h"
+            raise checks.input_error(f"ObservedCourse.frames[{k}]", sorted(both), rule)
         found.append(frame)
     return tuple(found)
+
+
+def _measures(frame: Observed) -> list[str]:
+    """The names of what a frame compares, as tables have them."""
+    return [_plain(name) for name in frame.plan.names]

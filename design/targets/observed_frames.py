@@ -19,6 +19,8 @@ def mask_frames(
 ) -> list[Observed]:
     """An `Observed` of each time, from its masks and its images by reporter."""
     call = "ObservedCourse.from_masks"
+    if "time" in options:
+        raise checks.input_error(f"{call}: time", options["time"], "left out, as times are given")
     moments = checks.vector(f"{call}: times", times)
     _check_count(f"{call}: masks", masks, len(moments))
     given = {} if fluorescence is None else fluorescence
@@ -65,7 +67,7 @@ def _check_count(what: str, given: Any, count: int) -> None:
 
 
 def measured_frames(
-    functions: Any, times: Any, values: Any, spread: Any, extinct: bool, smooth: bool
+    functions: Any, times: Any, values: Any, spread: Any, extinct: bool, smooth: bool, colonies: int
 ) -> list[Measured]:
     """The measures at each time, of those that are known there."""
     call = "ObservedCourse.of_measures"
@@ -92,7 +94,8 @@ def measured_frames(
         ]
         known = {name: functions[name] for name in there}
         if known:
-            frames.append(Measured(known, *parts, extinct=extinct, smooth=smooth, time=time))
+            how: Any = {"extinct": extinct, "smooth": smooth, "colonies": colonies}
+            frames.append(Measured(known, *parts, **how, time=time))
     if len(frames) < 2:
         given = f"{len(moments)} times, of which {len(frames)} have a value"
         hint = "Of one time, give Measured(…, time=…)."

@@ -17,10 +17,8 @@ from torchfilm import checks, tables
 COLONY, FRAME = "colony", "frame"
 # columns of times; each colony has one
 TIMES = ("time", "time_h", "time_min", "time_s", "timepoint", "t")
-KIND = {
-    "x": "length", "y": "length", "length": "length", "radius": "length", "angle": "angle",
-    "age": "time",
-}  # fmt: skip
+KIND = {"x": "length", "y": "length", "length": "length", "angle": "angle", "age": "time"}
+ROUNDED = 1e-3  # share by which a time may differ from that of a column
 
 
 def read_table(
@@ -59,11 +57,10 @@ def read_table(
             continue
         column, _, factor = known
         numbers = given.numbers(column)
-        if name in ("length", "age", "radius"):
-            above = name == "radius" or (name == "length" and length_with_caps)
-            _check_positive(given, column, numbers, above)
+        if name in ("length", "age"):
+            _check_positive(given, column, numbers, name == "length" and length_with_caps)
         found[name] = factor * torch.tensor(numbers)  # pandas may give what is read-only
-    time = _time(given, columns, units, used, time)
+    time = _time(given, columns, units, time)
     units.check_used(used)
     for name in species:
         column = columns.get(name, name)
@@ -80,6 +77,8 @@ def read_table(
             f" {', '.join(given.columns)}. Name yours by columns={{…}}."
         )
     _check_twice(given, found, owner)
+    if (radius := _radius(given, units)) is not None:
+        found["radius"] = radius
     return _cells(found, species, owner), time
 
 
@@ -134,28 +133,19 @@ def _check_one_time(
 
 
 def _time(
-    table: tables.Table,
-    columns: Mapping[str, str],
-    units: tables.Units,
-    used: set[tuple[str, str]],
-    stated: float | None,
+    table: tables.Table, columns: Mapping[str, str], units: tables.Units, stated: float | None
 ) -> float | None:
-    """When the cells were observed, h: as a column with a unit says, or as stated. Colonies of
-    several times, each of one, have none that is known. Raises InputError where both differ."""
+    """When the cells were observed, h: as a column time_h or time_min says, or as stated. Colonies
+    of several times, each of one, have none that is known. Raises InputError where both differ."""
     known = table.column("time", "time", {})
-    if known is None or columns.get(COLONY) == known[0]:
-        return stated
-    column, named = known
-    unit = named or units.stated("time")
-    if not unit:
-        return stated  # it may be the number of a frame
-    if not named:
-        used.add(("time", unit))
+    if known is None or not known[1] or columns.get(COLONY) == known[0]:
+        return stated  # without a unit it may be the number of a frame
+    column, unit = known
     times = np.unique(units.factor("time", unit, column) * table.numbers(column))
     if len(times) > 1:
         return stated
     found = float(times[0])
-    if stated is not None and abs(found - stated) > 1e-6 * abs(stated):
+    if stated is not None and abs(found - stated) > ROUNDED * abs(stated):
         rule = f"{found:g} h, as the column {column!r} says"
         hint = "Leave the column out where it is another time."
         raise checks.input_error("Observed(time)", stated, rule, hint)
@@ -164,7 +154,20 @@ def _time(
             f"{table.source}, column {column!r}: {found:g} h is not above 0. Cells of the first"
             " frame say how runs begin, which Scene(founders=…) does."
         )
-    return found
+    return found if stated is None else stated
+
+
+def _radius(table: tables.Table, units: tables.Units) -> Tensor | None:
+    """Of each cell, µm, where a column with a unit says it of all."""
+    known = table.column("radius", "length", {})
+    unit = known and (known[1] or units.stated("length"))
+    if not known or not unit or (unit == "px" and units.pixel_size is None):
+        return None
+    try:
+        found = units.factor("length", unit, known[0]) * table.numbers(known[0])
+    except tf.InputError:  # a number that is missing: the width serves a warning alone
+        return None
+    return torch.tensor(found) if (found > 0.0).all() else None
 
 
 def _check_one_frame(table: tables.Table, columns: Mapping[str, str]) -> None:

@@ -58,9 +58,10 @@ def check_relative(cells: SeenCells, plan: ColonyStatistics) -> None:
             error = float(level.std()) / count**0.5 if count > 1 else 0.0
             if mean <= (SURE * error if bool((level < 0).any()) else 0.0):
                 raise checks.input_error(
-                    f"the mean of {name} in colony {colony}",
+                    f"the mean of {name} in colony {colony} (counted from 0)",
                     f"{mean:.3g} ± {error:.2g}",
-                    "above 0 by two standard errors, as relative=True divides by it",
+                    "above 0, by two standard errors where levels are below it, as relative=True"
+                    " divides by it",
                     "Subtract less of a background, leave the reporter out, or compare it in units"
                     " with relative=False.",
                 )

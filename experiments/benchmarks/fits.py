@@ -7,12 +7,17 @@ whose losses have many minima.
 
 from __future__ import annotations
 
-import fit_colony  # in a folder that `tasks` puts on the path
+import sys
+from pathlib import Path
+
 import numpy as np
 from tasks import REPLICATES, SearchTask
 
 import torchfilm as tf
 from design import Observed, ObservedCourse, Parameter
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import fit_colony
 
 HOURS, DATA_SEED = 3.5, 77
 

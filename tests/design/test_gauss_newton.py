@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from asking import Room, begun
-from searching import banned, lit, objective_of, paced
+from searching import Level, banned, lit, objective_of, paced
 
 import torchfilm as tf
 from design import (
@@ -25,6 +25,7 @@ from design import (
     infer,
 )
 from design.methods import Bayesian, choose
+from design.objective import _shared
 from design.targets import Bands
 from torchfilm.tools.checks import InputError
 
@@ -99,8 +100,17 @@ def test_all_points_are_within_the_bounds_and_on_the_levels():
         assert batch.residuals and ((batch.points >= 0) & (batch.points <= 1)).all()
         assert np.isin(np.round(6 * batch.points[:, 1], 9), (1, 3, 5)).all()
         answer(method, batch, lambda p: p - 1.3)
-    best = method.ask().points[0]  # beyond a corner
+    best = method._points[method._loss.argmin()]  # beyond a corner
     assert best == pytest.approx([1.0, 5 / 6, 1.0])
+
+
+def test_no_design_of_levels_is_grown_twice():
+    method = begun(GaussNewton(), Room((9, 9)), seed=1)
+    grown = []
+    for _ in range(12):
+        grown += [p.tobytes() for p in method.ask().points]
+        answer(method, method.ask(), lines)
+    assert len(set(grown[9:])) >= len(grown[9:]) - 2  # Sobol points may be alike
 
 
 def test_designs_that_fail_are_left_out():
@@ -222,6 +232,23 @@ def test_a_design_that_fails_has_none():
     assert task.evaluate(np.array([[0.375, 0.5]]), residuals=True).residuals is None
 
 
+def test_replicates_without_a_share_in_the_loss_do_not_count():
+    """As those that fail, where the loss is a quantile."""
+    shares = np.array([[0.0, 0.5, 0.5], [1.0, 0.0, 0.0]])
+    residuals = np.array([[[np.nan], [1.0], [3.0]], [[np.nan], [1.0], [3.0]]])
+    found = _shared(shares, residuals)
+    assert found[0] == 2.0 and np.isnan(found[1]).all()
+
+
+class Untold(Level):
+    comparable = True
+
+
+def test_a_comparable_target_without_residuals_is_named():
+    with pytest.raises(TypeError, match=r"Untold\.residuals must return .* \(4, K\)"):
+        objective_of(lit, ONE[1:], Untold(), cells=4).evaluate(np.array([[0.5]]), residuals=True)
+
+
 def test_patterns_have_no_residuals_to_compare():
     with pytest.raises(InputError, match=r"residuals = True .* none that compare"):
         objective_of(lit, ONE[1:], EDGES, cells=4).evaluate(np.array([[0.5]]), residuals=True)
@@ -316,9 +343,10 @@ def test_a_study_goes_on_with_the_model_of_the_loss_that_it_began_with(tmp_path)
     assert isinstance(chosen.method, Bayesian) and chosen.why == "the study began with it"
 
 
-def test_choices_are_left_to_a_model_of_the_loss():
-    made = lambda rate=1.0, kind="slow": paced(rate, {"slow": 1.0, "fast": 3.0}[kind])
-    space = [RATE, Choice("kind", ["slow", "fast"])]
+@pytest.mark.parametrize("whole", [False, True])
+def test_choices_and_whole_numbers_are_left_to_a_model_of_the_loss(whole):
+    made = lambda rate=1.0, kind=1: paced(rate, {1: 1.0, 2: 3.0}[kind])
+    space = [RATE, Parameter("kind", 1, 2, whole=True) if whole else Choice("kind", [1, 2])]
     search = Search(made, space, observed(**TRUE), until=2.0, replicates=2)
     search.run(colonies=60, progress=False)
     assert "gaussnewton" not in search.why_chosen

@@ -66,6 +66,10 @@ def test_the_error_of_a_mean_is_less_by_the_root_of_the_colonies():
     assert standard_errors(both) == pytest.approx([*np.array(one.spread) / 2, 0.5])
     near = np.array(one.values) + np.array(one.spread)
     assert Prediction(one, np.zeros((1, 1)), near[None]).losses == pytest.approx([4.0])
+    # of a simulation of one colony: half of 1/4 + 1
+    alone = Prediction(one, np.zeros((1, 1)), near[None], replicates=1)
+    assert alone.losses == pytest.approx([1.6])
+    assert standard_errors(both, 1)[-1] == 0.5
 
 
 def test_what_was_seen_before_the_end_is_no_number_of_cells_at_the_end():

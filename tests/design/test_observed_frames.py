@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from searching import grown, paced
@@ -60,7 +62,7 @@ def test_several_colonies_at_each_time_and_their_fluorescence():
         ({"fluorescence": {"gfp": [masks(2)]}}, r"fluorescence\['gfp'\] = '1 of them'"),
         ({"masks": [masks(1), masks(1) * 0]}, "at 2 h: .*no cell"),
         ({"times": (2.0, 1.0)}, "above that of the frame before"),
-        ({"time": 3.0}, "time"),
+        ({"time": 3.0}, "time = 3.0 .* left out, as times are given"),
     ],
 )
 def test_wrong_movies(wrong, words):
@@ -108,11 +110,29 @@ def test_cells_and_a_measure_of_one_time_are_one_course():
     assert own == pytest.approx((count * apart[0] + apart[1]) / (count + 1))
 
 
-def test_two_of_one_kind_at_one_time_are_refused():
+def test_one_time_has_one_frame_of_each_kind():
     (state,) = states((2.0,))
     cells = Observed.from_state(state)
-    with pytest.raises(InputError, match="above that of the frame before, 2 h"):
-        ObservedCourse([cells, cells])
+    number = Measured({"volume": volume}, {"volume": 9.0}, {"volume": 1.0}, time=2.0)
+    for frames in ([cells, cells], [number, number], [cells, number, cells]):
+        with pytest.raises(InputError, match="above that of the frame before, 2 h"):
+            ObservedCourse(frames)
+
+
+@pytest.mark.parametrize("name", ["cells", "length_50_um"])
+def test_two_of_one_time_have_no_name_twice(name):
+    (state,) = states((2.0,))
+    number = Measured({name: volume}, {name: 9.0}, {name: 1.0}, time=2.0)
+    with pytest.raises(InputError, match=rf"\['{name}'\] .* other names than the Observed of 2 h"):
+        ObservedCourse([Observed.from_state(state), number])
+
+
+def test_a_measure_that_is_no_number_at_the_end_is_named():
+    (state,) = states((2.0,))
+    number = Measured({"none": lambda s: volume(s) * math.nan}, {"none": 9.0}, {"none": 1.0},
+                      time=2.0)  # fmt: skip
+    why = ObservedCourse([Observed.from_state(state), number]).unfit(state)
+    assert len(why) == 2 and all("none" in words for words in why)
 
 
 def test_a_measure_is_of_as_many_colonies_as_it_says():

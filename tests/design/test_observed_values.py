@@ -9,7 +9,7 @@ import pytest
 from searching import grown, paced
 
 import torchfilm as tf
-from design import Observed, Parameter, Search, Task
+from design import Observed, ObservedCourse, Parameter, Search, Task
 from torchfilm.tools.checks import InputError
 
 TABLE = {"x_um": [0.0, 3.0, 6.0], "y_um": [0.0, 1.0, 2.0], "length_um": [2.0, 3.0, 2.5]}
@@ -27,8 +27,8 @@ RATE = [Parameter("rate", 0.5, 2.0)]
     [
         ({"time_h": [1.5] * 3}, {}),
         ({"time_min": [90.0] * 3}, {}),
-        ({"time": [90.0] * 3}, {"time_unit": "min"}),
         ({"time_min": [90.0] * 3}, {"time": 1.5}),
+        ({"time_min": [90.02] * 3}, {"time": 1.5}),  # rounded
     ],
 )
 def test_a_column_of_times_says_when_cells_were_observed(column, options):
@@ -49,6 +49,8 @@ def test_a_time_is_not_contradicted():
 def test_what_may_be_the_number_of_a_frame_is_no_time(column):
     assert Observed.from_table(TABLE | column).time is None
     assert Observed.from_table(TABLE | column, time=2.0).time == 2.0
+    aged = TABLE | column | {"age": [30.0] * 3}  # the unit is that of ages
+    assert Observed.from_table(aged, time_unit="min").time is None
 
 
 def test_a_unit_that_no_column_needs_is_still_refused():
@@ -80,8 +82,32 @@ def test_the_width_is_that_of_all_readers(tmp_path):
     image[10:17, 5:30] = 1
     image[22:29, 5:30] = 2
     assert Observed.from_masks(image, pixel_size=0.1).width == pytest.approx(0.7, abs=0.08)
-    with pytest.raises(InputError, match=r"column 'radius_um': -0\.3 is not above 0"):
-        Observed.from_table(TABLE | {"radius_um": [0.3, -0.3, 0.3]})
+
+
+@pytest.mark.parametrize(
+    "column",
+    [{"radius": [0.3] * 3}, {"radius_um": [0.3, -0.3, 0.3]}, {"radius_um": [0.3, None, 0.3]},
+     {"radius_px": [3.0] * 3}],
+)  # fmt: skip
+def test_a_radius_that_says_nothing_is_left_aside(column):
+    """The width serves a warning, and nothing else."""
+    assert Observed.from_table(TABLE | column).width is None
+
+
+def test_the_width_of_a_course_is_told_once():
+    each = [Observed.from_table(TABLE | {"radius_um": [r] * 3}, time=t) for t, r in
+            ((0.5, 0.33), (1.0, 0.35))]  # fmt: skip
+    course = ObservedCourse(each)
+    assert course.width == pytest.approx(0.68)
+    with pytest.warns(UserWarning, match=r"0\.68 µm wide") as told:
+        Task(flat, RATE, course)
+    assert len({str(w.message) for w in told}) == 1
+
+
+def test_a_width_is_nothing_that_losses_depend_on():
+    """Older studies go on."""
+    one, other = (Observed.from_table(TABLE | {"radius_um": [r] * 3}) for r in (0.45, 0.5))
+    assert repr(one) == repr(other) and tf.digest(one) == tf.digest(other) and one == other
 
 
 @pytest.mark.parametrize(
@@ -102,6 +128,6 @@ def test_a_mean_that_is_not_above_0_divides_nothing(levels, sound):
         seen = Observed.from_table(table, species=("gfp",), relative=True)
         assert np.isfinite(seen.values).all()
         return
-    with pytest.raises(InputError, match=r"the mean of gfp in colony 0 = .* relative=True divides"):
+    with pytest.raises(InputError, match=r"the mean of gfp in colony 0 .* relative=True divides"):
         Observed.from_table(table, species=("gfp",), relative=True)
     assert Observed.from_table(table, species=("gfp",)).plan.species == ("gfp",)

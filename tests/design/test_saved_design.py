@@ -257,6 +257,15 @@ def test_ready_targets_and_parameters_are_plain_data(value):
     assert type(again) is type(value) and again == value and repr(again) == repr(value)
 
 
+def test_dictionaries_are_what_they_were():
+    for value in ({"pairs": [1.0]}, {"a": {2: "b"}}, {0: {"c": 1}}):
+        again = from_data(json.loads(json.dumps(to_data(value))))
+        assert again == from_data(to_data(value)) and list(again) == list(value)
+    for bad in ({"kind": "pairs"}, {"kind": "pairs", "pairs": 3}):
+        with pytest.raises(tf.InputError, match="no pairs of a name and a value"):
+            from_data(bad)
+
+
 @pytest.mark.parametrize(
     "value", [Level(), Choice("gate", ("a", "b"), resolve=dict), [Weighted([(Level(), 1.0)])]]
 )

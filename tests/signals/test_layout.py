@@ -33,6 +33,7 @@ def test_what_is_made_ready_belongs_to_one_grid():
     assert "mask" not in vars(other) and layout.mask is mask is not other.mask
 
 
+@pytest.mark.usefixtures("new_objects")
 def test_steps_belong_to_one_grid_and_go_with_it():
     """A model makes the step of a signal once for each grid; one that is no longer used takes its
     steps along."""

@@ -112,6 +112,7 @@ def test_terms_backwards():
             assert all(torch.equal(a, b) for a, b in zip(found[::-1], expected, strict=True))
 
 
+@pytest.mark.usefixtures("new_objects")
 def test_few_terms_are_held_at_once():
     mixing, _, _, u = made()
     kept: list[int] = []
