@@ -44,11 +44,11 @@ class GaussNewton(AskTell):
     sum of squares of these lines is least, within a box about the best; the others are drawn from
     the posterior that the lines imply, so that they spread where the data say little. The box
     widens after a batch that gains, and narrows after another, sooner far from any fit; at its
-    least, a new start follows.
-    Such slopes see through scatter and small steps, which derivatives do not, and need no colonies
-    of their own. After Cartis and Roberts (Math. Program. Comput. 11, 631, 2019), whose method is
-    for one design at a time. A dimension with levels is rounded to these, so it should have an
-    order; a design that was grown already is one at random in its place.
+    least, a new start follows. Such slopes see through scatter and small steps, which derivatives
+    do not, and need no colonies of their own. After Cartis and Roberts (Math. Program. Comput. 11,
+    631, 2019), whose method is for one design at a time. A dimension with levels is rounded to
+    these, so it should have an order; a design that was grown already is one at random in its
+    place.
     """
 
     squares = True  # needs the residuals of data
@@ -126,9 +126,8 @@ class GaussNewton(AskTell):
         middle = np.clip(centre + step, 0.0, 1.0)
         information = root**2 * slopes @ slopes.T + np.eye(size) / BROAD**2
         rng = np.random.default_rng([self._seed, self._batches])
-        normal = rng.standard_normal(
-            ((self.batch or max(LEAST_BATCH, math.ceil(BATCH * size))) - 1, size)
-        )
+        count = self.batch or max(LEAST_BATCH, math.ceil(BATCH * size))
+        normal = rng.standard_normal((count - 1, size))
         away = np.linalg.solve(np.linalg.cholesky(information).T, normal.T).T
         about = np.clip(middle + np.clip(away, -self._box, self._box), 0.0, 1.0)
         return np.vstack([middle, about])
