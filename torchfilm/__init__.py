@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from torchfilm import measure, pictures, scenes
     from torchfilm.cellmodeller import from_cellmodeller
     from torchfilm.explanation import explain
+    from torchfilm.io.lineage import Lineage
     from torchfilm.io.recorder import Recorder
     from torchfilm.io.results import Results
     from torchfilm.io.table import cell_table
@@ -70,6 +71,7 @@ if TYPE_CHECKING:
 _LAZY_MODULES = ("measure", "pictures", "scenes")
 _LAZY = {
     "LivePlot": "torchfilm.pictures",
+    "Lineage": "torchfilm.io.lineage",
     "Recorder": "torchfilm.io.recorder",
     "Results": "torchfilm.io.results",
     "cell_table": "torchfilm.io.table",
@@ -101,6 +103,7 @@ __all__ = [
     "Growth",
     "GrowthRecording",
     "InputError",
+    "Lineage",
     "LivePlot",
     "LogNormal",
     "Lysis",

@@ -3,18 +3,21 @@ ended."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
 
 from torchfilm.io.layout import LINEAGE, LINEAGE_LATER, LINEAGE_NUMBERS
+from torchfilm.io.newick import newick
 from torchfilm.io.reading import blaming_file, committed, read_dataset
 from torchfilm.io.table import Tables, data_frame, needed
+from torchfilm.io.tracks import LOST, Tracks, challenge_tracks, table_tracks
 from torchfilm.state import FATES
-from torchfilm.tools import checks
+from torchfilm.tools import checks, tables
 from torchfilm.tools.checks import InputError
 
 if TYPE_CHECKING:
@@ -38,67 +41,143 @@ def _column(file: h5py.File, name: str, count: int) -> np.ndarray:
 
 
 class Lineage:
-    """Every cell of a recorded run, as arrays (N,), and as a tree.
+    """Every cell of a recorded run, or of a movie (`from_table`, `from_ctc`), as arrays (N,), and
+    as a tree.
 
     colony: id of its colony · cell: its uid, unique within the colony · parent: uid, −1 for
     founders · sister: uid of the other daughter of its mother, −1 where the file has none ·
     generation: divisions since the first of its line in the file · pole_age: divisions since the
-    older of its poles was formed, as far as the file goes back: 1 is the least of a daughter, and
-    the mother of a dead-end channel has her generation · born: h; the founders' is the start of the
-    run, and that of cells which a run found in the middle of another is not known, NaN · ended: h,
-    NaN while it lives · fate: "alive", "divided", "removed", "left", "lysed", "eroded", "sloughed"
-    or "failed" · birth_length, end_length: of the centreline, µm, when it was born and ended; NaN
-    where that hour is NaN, and in files of earlier versions but for founders · cell_type: when it
-    ended, or in the last frame while it lives; −1 in a scene without types, and of ends in files of
-    earlier versions · founder: uid of the first of its line in the file.
+    older of its poles was formed, as far as the file goes back (−1 of movies, which do not tell
+    it): 1 is the least of a daughter, and the mother of a dead-end channel has her generation ·
+    born: h; the founders' is the start of the run, and that of cells which a run found in the
+    middle of another is not known, NaN · ended: h, NaN while it lives · fate: "alive", "divided",
+    "removed", "left", "lysed", "eroded", "sloughed" or "failed", of a movie also "lost" ·
+    birth_length, end_length: of the centreline, µm, when it was born and ended; NaN where that hour
+    is NaN, and in files of earlier versions but for founders · cell_type: when it ended, or in the
+    last frame while it lives; −1 in a scene without types, and of ends in files of earlier versions
+    · founder: uid of the first of its line in the file.
 
     Cells are named by uid, and in a run of several colonies by `colony`, an id, too. `course` reads
     the file, which must be open. Raises InputError for cells and colonies that the run does not
     have.
     """
 
-    def __init__(self, results: Results):
-        self._results = results
+    def __init__(
+        self,
+        colony: np.ndarray,
+        cell: np.ndarray,
+        parent: np.ndarray,
+        *,
+        source: str | Path,
+        begin: float,
+        now: float,
+        known: Sequence[int],
+        results: Results | None = None,
+    ):
+        """Cells (N,), mothers before daughters, of which nothing else is known. source: for
+        messages; begin, now: h, of the first and last frame; known: the ids of all colonies."""
+        self._results, self._path, self._known = results, source, list(known)
+        self.begin, self.now = begin, now
+        self.colony, self.cell, self.parent = colony, cell, parent
+        self.born, self.ended, self.birth_length, self.end_length = (
+            np.full(len(cell), np.nan) for _ in range(4)
+        )
+        self.fate = np.full(len(cell), "alive", dtype="<U8")
+        self.cell_type = np.full(len(cell), -1)
+        self._order = np.argsort(_pair(colony, cell))
+        self._keys = _pair(colony, cell)[self._order]
+
+    @staticmethod
+    def of_results(results: Results) -> Lineage:
+        """That of a results file."""
         file, size, first = results.file, committed(results.file), results.frame(0)
         births, ends = (
             {n: _column(file, f"lineage/{t}/{n}", size[t]) for n in LINEAGE[t]}
             for t in ("births", "ends")
         )
         steps, times = results.steps, results.times
-        self.frames = size["frames"]
-        self.begin, self.now = float(times[0]), float(times[self.frames - 1])
-        self._path, self._known = results.path, results.colony_id.tolist()
-        self.colony: np.ndarray = np.concatenate(
-            [results.colony_id[first["colony"]], births["colony_id"]]
-        )
-        self.cell: np.ndarray = np.concatenate([first["uid"], births["uid"]])
-        self.parent: np.ndarray = np.concatenate([first["parent"], births["parent"]])
+        last = size["frames"] - 1
+        made = Lineage(
+            np.concatenate([results.colony_id[first["colony"]], births["colony_id"]]),
+            np.concatenate([first["uid"], births["uid"]]),
+            np.concatenate([first["parent"], births["parent"]]),
+            source=results.path, begin=float(times[0]), now=float(times[last]),
+            known=results.colony_id.tolist(), results=results,
+        )  # fmt: skip
         founded = np.where((first["parent"] < 0) & (steps[0] == 0), times[0], np.nan)
-        # files of earlier versions have the step only
-        hours = lambda t: np.where(
-            np.isnan(t["time"]), np.interp(t["step"], steps, times), t["time"]
-        )
-        self.born: np.ndarray = np.concatenate([founded, hours(births)])
+        then = lambda t: np.interp(t["step"], steps, times)  # all that earlier versions have
+        hours = lambda t: np.where(np.isnan(t["time"]), then(t), t["time"])
+        made.born = np.concatenate([founded, hours(births)])
         lengths = np.where(np.isnan(founded), np.nan, first["length"])
-        self.birth_length: np.ndarray = np.concatenate([lengths, births["length"]])
-        self.ended, self.end_length = (np.full(len(self.cell), np.nan) for _ in range(2))
-        self.fate = np.full(len(self.cell), "alive", dtype="<U8")
-        self._order = np.argsort(_pair(self.colony, self.cell))
-        self._keys = _pair(self.colony, self.cell)[self._order]
-        at = self._rows(ends["colony_id"], ends["uid"])
-        self.ended[at] = hours(ends)
+        made.birth_length = np.concatenate([lengths, births["length"]])
+        at = made._rows(ends["colony_id"], ends["uid"])
+        made.ended[at] = hours(ends)
         if not np.isin(ends["fate"], np.arange(len(FATES))).all():
             raise InputError(
-                f"{self._path} is damaged: it has ends of no known fate. Use another copy of it."
+                f"{results.path} is damaged: it has ends of no known fate. Use another copy of it."
             )
-        self.fate[at] = np.asarray(FATES)[ends["fate"]]
-        self.end_length[at] = ends["length"]
-        self.cell_type = np.full(len(self.cell), -1)
-        last = results.frame(self.frames - 1)
-        if "cell_type" in last:
-            alive = self._rows(results.colony_id[last["colony"]], last["uid"])
-            self.cell_type[alive] = last["cell_type"]
-        self.cell_type[at] = ends["cell_type"]
+        made.fate[at] = np.asarray(FATES)[ends["fate"]]
+        made.end_length[at] = ends["length"]
+        living = results.frame(last)
+        if "cell_type" in living:
+            alive = made._rows(results.colony_id[living["colony"]], living["uid"])
+            made.cell_type[alive] = living["cell_type"]
+        made.cell_type[at] = ends["cell_type"]
+        return made
+
+    @staticmethod
+    @checks.known_keywords
+    def from_table(
+        table: str | Path | Mapping[str, Any],
+        *,
+        pixel_size: float | None = None,
+        length_unit: str | None = None,
+        time_unit: str | None = None,
+        columns: Mapping[str, str] | None = None,
+        width: float | None = None,
+    ) -> Lineage:
+        """Cells that a microscope has followed: a row for each cell in each frame, of a CSV file or
+        of columns by name.
+
+        Columns: cell, a number; parent, that of the cell from which it descends, −1, 0 (where no
+        cell is 0) or nothing where none is known; time; length, which may be missing; colony, a
+        number for each movie. columns: their names where they differ. Units stand in the names, as
+        in time_min and length_um, or in the arguments. width: µm, where lengths are those of whole
+        cells so wide: it is taken off them.
+
+        A cell is born in its first frame, if its parent is known, and divides as the first of its
+        daughters begins. Without any it is "alive" in the last frame of its colony, and else
+        "lost", in its own. Raises InputError for what is no number, parents that are no cells or
+        begin no earlier than their daughters, and two rows of a cell at one time.
+        """
+        units = tables.Units(pixel_size, length_unit, None, time_unit)
+        source = str(table) if isinstance(table, (str, Path)) else "the table"
+        return Lineage._of_tracks(table_tracks(table, columns or {}, units, width), source)
+
+    @staticmethod
+    def from_ctc(path: str | Path, *, interval: float) -> Lineage:
+        """Cells in a file of tracks of the Cell Tracking Challenge, such as man_track.txt, without
+        their lengths. interval: h between frames. Else as `from_table`."""
+        return Lineage._of_tracks(challenge_tracks(path, interval), str(path))
+
+    @staticmethod
+    def _of_tracks(tracks: Tracks, source: str) -> Lineage:
+        made = Lineage(
+            tracks.colony, tracks.cell, tracks.parent, source=source,
+            begin=float(tracks.first.min()), now=float(tracks.end.max()),
+            known=np.unique(tracks.colony).tolist(),
+        )  # fmt: skip
+        known = tracks.parent >= 0
+        made.born = np.where(known, tracks.first, np.nan)
+        made.birth_length = np.where(known, tracks.birth_length, np.nan)
+        mothers = made._mothers
+        ended = np.full(len(made), np.inf)
+        np.minimum.at(ended, mothers[known], tracks.first[known])
+        divided, lost = np.isfinite(ended), tracks.last < tracks.end
+        made.ended = np.where(divided, ended, np.where(lost, tracks.last, np.nan))
+        made.fate = np.where(divided, "divided", np.where(lost, LOST, "alive")).astype("<U8")
+        made.end_length = np.where(divided | lost, tracks.end_length, np.nan)
+        return made
 
     def __len__(self) -> int:
         return len(self.cell)
@@ -108,8 +187,7 @@ class Lineage:
         return f"Lineage({len(self)} cells in {colonies} colonies, {self.now:g} h)"
 
     def to_pandas(self) -> Any:
-        """A pandas.DataFrame with one row per cell: colony, cell, parent, sister, founder,
-        generation, pole_age, born, ended, fate, birth_length, end_length, cell_type."""
+        """A pandas.DataFrame with one row per cell and the columns above."""
         return data_frame({name: getattr(self, name) for name in COLUMNS})
 
     def born_of(self, colony: np.ndarray, cell: np.ndarray) -> np.ndarray:
@@ -154,6 +232,8 @@ class Lineage:
 
     @cached_property
     def pole_age(self) -> np.ndarray:
+        if self._results is None:
+            return np.full(len(self), -1)
         # the daughter with the lower number keeps the end against its mother's axis, the other one
         # the end along it
         ages, lower = np.zeros((2, len(self)), np.int64), self.cell < self.sister
@@ -227,9 +307,11 @@ class Lineage:
         one row per frame since its founder."""
         colony = self.colony_of_run(colony)
         line = [int(cell), *self.ancestors(cell, colony)]
-        tables = Tables(self._results, self, internals=False)
+        if self._results is None:
+            raise InputError(f"{self._path} is no results file: take the rows of the cells {line}.")
+        frames = committed(self._results.file)["frames"]
         keep = lambda ids, uid: (ids == colony) & np.isin(uid, line)
-        return tables(range(self.frames), keep)
+        return Tables(self._results, self, internals=False)(range(frames), keep)
 
     def to_newick(self, colony: int | None = None, *, alive: bool = False) -> str:
         """The trees of one colony, or of all, in Newick format: a line for each founder. Nodes are
@@ -239,7 +321,11 @@ class Lineage:
         checks.choice("alive", alive, (True, False))
         kept = self._leading_to_life if alive else np.ones(len(self), bool)
         roots = [row for row in self._roots(colony) if kept[row]]
-        return "".join(f"{self._newick(row, kept)};\n" for row in roots)
+        born = np.where(np.isnan(self.born), self.begin, self.born)
+        lived = np.where(np.isnan(self.ended), self.now, self.ended) - born
+        name = lambda row: "colony{}.cell{}".format(*self._node(row))
+        below = {row: [d for d in of if kept[d]] for row, of in self._daughters.items()}
+        return "".join(f"{newick(row, below, lived, name)};\n" for row in roots)
 
     @cached_property
     def _leading_to_life(self) -> np.ndarray:
@@ -347,27 +433,6 @@ class Lineage:
 
     def _node(self, row: int) -> tuple[int, int]:
         return int(self.colony[row]), int(self.cell[row])
-
-    def _newick(self, root: int, kept: np.ndarray) -> str:
-        """The tree below a row, of `kept` cells (N,), without recursion: a lineage may be thousands
-        of cells deep."""
-        born = np.where(np.isnan(self.born), self.begin, self.born)
-        lived = np.where(np.isnan(self.ended), self.now, self.ended) - born
-        text: list[str] = []
-        stack: list[int | str] = [root]
-        while stack:
-            item = stack.pop()
-            if isinstance(item, str):
-                text.append(item)
-                continue
-            colony, cell = self._node(item)
-            stack.append(f"colony{colony}.cell{cell}:{lived[item]:.6g}")
-            if daughters := [d for d in self._daughters.get(item, ()) if kept[d]]:
-                stack.append(")")
-                for daughter in reversed(daughters):
-                    stack += [daughter, ","]
-                stack[-1] = "("
-        return "".join(text)
 
 
 def _pair(colony: np.ndarray, cell: np.ndarray) -> np.ndarray:

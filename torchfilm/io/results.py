@@ -276,7 +276,7 @@ class Results(metaclass=checks.KnownKeywords):
 
     def lineage(self) -> Lineage:
         """Every cell that ever lived, as arrays and as a tree."""
-        return Lineage(self)
+        return Lineage.of_results(self)
 
     @checks.known_keywords
     def to_vtkhdf(

@@ -1,0 +1,175 @@
+"""Lineages of movies: tables of tracked cells, and the files of the Cell Tracking Challenge."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import torchfilm as tf
+from torchfilm.tools.checks import InputError
+
+# cell 1 divides into 2 and 3 after 20 min; 2 into 4 and 5 at 40; 3 leaves after 30 min
+ROWS = [
+    (1, 0, 0, 2.0), (1, 0, 10, 3.0), (2, 1, 20, 1.6), (3, 1, 20, 1.4), (2, 1, 30, 2.4),
+    (3, 1, 30, 2.0), (4, 2, 40, 1.2), (5, 2, 40, 1.1), (4, 2, 50, 1.5), (5, 2, 50, 1.4),
+]  # fmt: skip
+
+
+def table(rows=ROWS, **more):
+    names = ("cell", "parent", "time_min", "length_um")
+    return dict(zip(names, map(list, zip(*rows, strict=True)), strict=True)) | more
+
+
+def test_births_divisions_and_losses_are_found():
+    tree = tf.Lineage.from_table(table())
+    assert tree.cell.tolist() == [1, 2, 3, 4, 5] and tree.parent.tolist() == [-1, 1, 1, 2, 2]
+    hours = lambda *minutes: pytest.approx(np.array(minutes) / 60, nan_ok=True)
+    assert tree.born == hours(np.nan, 20, 20, 40, 40)  # of the first nobody knows
+    assert tree.ended == hours(20, 40, 30, np.nan, np.nan)
+    assert tree.fate.tolist() == ["divided", "divided", "lost", "alive", "alive"]
+    assert tree.birth_length == pytest.approx([np.nan, 1.6, 1.4, 1.2, 1.1], nan_ok=True)
+    assert tree.end_length == pytest.approx([3.0, 2.4, 2.0, np.nan, np.nan], nan_ok=True)
+    assert tree.begin == 0.0 and tree.now == pytest.approx(5 / 6)
+
+
+def test_it_is_a_tree_as_that_of_a_run():
+    tree = tf.Lineage.from_table(table())
+    assert tree.descendants(1) == [2, 3, 4, 5] and tree.ancestors(5) == [2, 1]
+    assert tree.sister.tolist() == [-1, 3, 2, 5, 4] and tree.founder.tolist() == [1] * 5
+    assert tree.generation.tolist() == [0, 1, 1, 2, 2] and tree.common_ancestor([4, 3]) == 1
+    assert tree.pairs("mother").tolist() == [[0, 1], [0, 2], [1, 3], [1, 4]]
+    assert tree.clone_sizes() == {1: 2} and tree.living_descendants.tolist() == [2, 2, 0, 1, 1]
+    wanted = "((colony0.cell4:0.166667,colony0.cell5:0.166667)colony0.cell2:0.333333,"
+    assert tree.to_newick().startswith(wanted)
+    cells = tree.to_pandas()
+    assert cells.pole_age.tolist() == [-1] * 5  # a movie does not tell poles
+    assert cells.fate.tolist() == tree.fate.tolist()
+    with pytest.raises(
+        InputError, match=r"no results file: .* cells \[4, 2, 1\]"
+    ):
+        tree.course(4)
+
+
+@pytest.mark.parametrize("parents", [[-1] * 2, ["", ""], [None, None], [float("nan")] * 2, [0, 0]])
+def test_what_says_that_there_is_no_parent(parents):
+    given = table()
+    given["parent"] = [*parents, *given["parent"][2:]]
+    assert tf.Lineage.from_table(given).parent[0] == -1
+
+
+def test_a_parent_may_stand_in_the_first_row_alone_and_0_may_be_a_cell():
+    rows = [(0, -1, 0, 2.0), (0, -1, 10, 3.0), (1, 0, 20, 1.5), (2, 0, 20, 1.5), (1, -1, 30, 2.0),
+            (2, -1, 30, 2.0)]  # fmt: skip
+    tree = tf.Lineage.from_table(table(rows))
+    assert tree.parent.tolist() == [-1, 0, 0] and tree.fate[0] == "divided"
+
+
+def test_movies_are_apart_and_each_has_its_end():
+    rows = [*ROWS, *((c, p, t, x) for c, p, t, x in ROWS if t <= 30)]
+    tree = tf.Lineage.from_table(table(rows, colony=[7] * 10 + [2] * 6))
+    second = tree.colony == 2
+    assert tree.fate[second].tolist() == ["divided", "alive", "alive"]
+    assert tree.descendants(1, colony=7) == [2, 3, 4, 5] and tree.descendants(1, colony=2) == [2, 3]
+    with pytest.raises(InputError, match=r"has the colonies 2, 7: say which"):
+        tree.ancestors(2)
+
+
+def test_units_names_and_widths():
+    given = {"ID": [r[0] for r in ROWS], "mother": [r[1] for r in ROWS],
+             "when": [r[2] for r in ROWS], "major": [(r[3] + 1.0) / 0.1 for r in ROWS]}  # fmt: skip
+    names = {"cell": "ID", "parent": "mother", "time": "when", "length": "major"}
+    tree = tf.Lineage.from_table(given, columns=names, time_unit="min", pixel_size=0.1, width=1.0)
+    plain = tf.Lineage.from_table(table())
+    assert tree.end_length == pytest.approx(plain.end_length, nan_ok=True)
+    assert tree.born == pytest.approx(plain.born, nan_ok=True)
+    bare = table()
+    del bare["length_um"]
+    assert np.isnan(tf.Lineage.from_table(bare).end_length).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"time_min": None}, "lacks the column 'time_h'"),
+        ({"parent": None}, "lacks the column 'parent'.*−1 of those of none"),
+        ({"parent": [9] * 10}, "cell 1 has the parent 9, which is no cell of its colony"),
+        ({"parent": ["x"] * 10}, "'x' must be a whole number, or empty"),
+        ({"cell": [1.5] * 10}, "1.5 must be a whole number from 0"),
+        ({"cell": [1] * 10, "parent": [0] * 10}, "cell 1 of colony 0 has two rows at"),
+        ({"parent": [0, 0, 1, 1, 1, 1, 2, 2, 3, 2]}, "cell 4 of colony 0 has two parents, "),
+        ({"time_min": [20] + [r[2] for r in ROWS[1:]], "cell": [1, 6] + [r[0] for r in ROWS[2:]]},
+         "cell 2 begins at 0.333333 h, no later than its parent 1"),
+        ({"length_um": [-1.0] * 10}, "-1 µm is no length of a centreline"),
+        ({"width": 2.5}, "-0.5 µm is no length of a centreline"),
+        ({"width": 0.0}, r"width\) = 0"),
+        ({"time_unit": "min"}, "time_unit = 'min'.*left out"),
+        ({"columns": {"size": "x"}}, r"columns\) = 'size'"),
+    ],
+)  # fmt: skip
+def test_wrong_tables(change, words):
+    options = {k: v for k, v in change.items() if k in ("width", "time_unit", "columns")}
+    given = {k: v for k, v in (table() | change).items() if v is not None and k not in options}
+    with pytest.raises(InputError, match=words):
+        tf.Lineage.from_table(given, **options)
+
+
+def test_cells_with_one_daughter_are_told():
+    rows = [r for r in ROWS if r[0] != 5]
+    with pytest.warns(UserWarning, match=r"1 cells have one daughter \(such as 2\)"):
+        tree = tf.Lineage.from_table(table(rows))
+    assert tree.fate[1] == "divided" and tree.sister.tolist() == [-1, 3, 2, -1]
+
+
+def test_a_file_of_tracks(tmp_path):
+    path = tmp_path / "man_track.txt"
+    path.write_text("1 0 1 0\n2 2 3 1\n3 2 3 1\n4 4 5 2\n5 4 5 2\n", encoding="utf-8")
+    tree, other = tf.Lineage.from_ctc(path, interval=1 / 6), tf.Lineage.from_table(table())
+    for name in ("cell", "parent", "fate"):
+        assert getattr(tree, name).tolist() == getattr(other, name).tolist()
+    for name in ("born", "ended"):
+        assert getattr(tree, name) == pytest.approx(getattr(other, name), nan_ok=True)
+    assert tree.now == pytest.approx(5 / 6) and np.isnan(tree.birth_length).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("1 0 1\n", "four whole numbers"),
+        ("1 0 a 0\n", "four whole numbers"),
+        ("1 0 1 0\n1 0 2 0\n", "each label must be there once"),
+        ("1 3 1 0\n", "end after it begins"),
+        ("", "four whole numbers"),
+    ],
+)
+def test_wrong_files_of_tracks(tmp_path, text, words):
+    path = tmp_path / "t.txt"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=words):
+        tf.Lineage.from_ctc(path, interval=0.1)
+    with pytest.raises(InputError, match=r"interval\) = 0"):
+        tf.Lineage.from_ctc(path, interval=0.0)
+    with pytest.raises(InputError, match="the file of tracks"):
+        tf.Lineage.from_ctc(tmp_path / "none.txt", interval=0.1)
+
+
+def test_the_lineage_of_a_run_is_that_of_its_tracks(tmp_path):
+    """A frame after every step: the tracks of the frames have all that the file's lineage has."""
+    scene = tf.Scene(tf.Growth(rate=1.5), tf.Division(length=tf.Uniform(3.0, 4.0)), dim=2, dt=0.1)
+    record = tf.Recorder(tmp_path / "run.h5", scene, every=1)
+    list(tf.simulate(scene, until=2.0, colonies=2, seed=3, record=record))
+    with tf.Results(tmp_path / "run.h5") as results:
+        whole, rows = results.lineage(), results.to_pandas()
+    # the table of a run has the parent's number in `parent`
+    named = {"cell": rows.cell, "parent": rows.parent, "time_h": rows.time,
+             "length_um": rows.length, "colony": rows.colony}  # fmt: skip
+    tree = tf.Lineage.from_table(named)
+    assert len(tree) == len(whole)
+    order = [np.lexsort((t.cell, t.colony)) for t in (tree, whole)]
+    for name in ("colony", "cell", "parent", "fate", "generation"):
+        one, other = (getattr(t, name)[k] for t, k in zip((tree, whole), order, strict=True))
+        assert one.tolist() == other.tolist(), name
+    born, theirs = (t.born[k] for t, k in zip((tree, whole), order, strict=True))
+    later = whole.parent[order[1]] >= 0
+    assert born[later] == pytest.approx(theirs[later])
+    ended, theirs = (t.ended[k] for t, k in zip((tree, whole), order, strict=True))
+    assert ended == pytest.approx(theirs, nan_ok=True)

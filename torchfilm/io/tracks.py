@@ -1,0 +1,189 @@
+"""Tracked cells of a microscope: tables with a row for each cell in each frame, and the files of
+the Cell Tracking Challenge."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchfilm.tools import checks, tables
+from torchfilm.tools.checks import InputError
+from torchfilm.tools.warn_once import warn
+
+MEANT = ("cell", "parent", "colony", "time", "length")
+NONE = -1  # of a parent
+LOST = "lost"  # the fate of a track that ends before the movie, without daughters
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """One row for each track, sorted by the hour at which it begins.
+
+    colony, cell, parent (−1: none known): (N,) int64. first, last: h, of its first and last frame.
+    birth_length, end_length: µm, in these frames, NaN where lengths are not known. end: h, of the
+    last frame of its movie.
+    """
+
+    colony: np.ndarray
+    cell: np.ndarray
+    parent: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+    birth_length: np.ndarray
+    end_length: np.ndarray
+    end: np.ndarray
+
+
+def table_tracks(
+    table: Any, columns: Mapping[str, str], units: tables.Units, width: float | None
+) -> Tracks:
+    """The tracks of a table with a row for each cell in each frame. width: of the cells, µm, which
+    lengths include; None where they are those of centrelines."""
+    given = tables.Table.read(table)
+    for name in columns:
+        checks.choice("Lineage.from_table(columns)", name, MEANT)
+    used: set[tuple[str, str]] = set()
+    time = given.quantity("time", "time", columns, units, used)
+    if time is None:
+        raise given.missing("time_h", "Give the hour of each row, as time_h or time_min.")
+    hours = time[2] * given.numbers(time[0])
+    length = given.quantity("length", "length", columns, units, used)
+    sizes: Any = np.full(given.rows, np.nan)
+    if width is not None:
+        checks.number("Lineage.from_table(width)", width, above=0.0)
+    if length is not None:
+        sizes = length[2] * given.numbers(length[0]) - (width or 0.0)
+        if (sizes < 0.0).any():
+            row = int(np.flatnonzero(sizes < 0.0)[0])
+            raise InputError(f"{given.place(row)}: {sizes[row]:g} µm is no length of a centreline.")
+    units.check_used(used)
+    cell = _whole(given, columns.get("cell", "cell"))
+    named = columns.get("colony", "colony")
+    colony = _whole(given, named) if named in given.columns else np.zeros(given.rows, np.int64)
+    if "colony" in columns and named not in given.columns:
+        raise given.missing(named)
+    parent = _parents(given, columns.get("parent", "parent"), cell)
+    order = np.lexsort((hours, cell, colony))
+    colony, cell, parent = colony[order], cell[order], parent[order]
+    hours, sizes = hours[order], sizes[order]
+    begins = np.ones(len(cell), bool)
+    begins[1:] = (colony[1:] != colony[:-1]) | (cell[1:] != cell[:-1])
+    twice = np.flatnonzero(~begins & (np.diff(hours, prepend=-np.inf) <= 0.0))
+    if twice.size:
+        k = int(twice[0])
+        raise InputError(
+            f"{given.source}: cell {cell[k]} of colony {colony[k]} has two rows at {hours[k]:g} h."
+        )
+    starts = np.flatnonzero(begins)
+    ends = np.append(starts[1:], len(cell)) - 1
+    # a program may name the mother in the first row of a track alone
+    mothers = np.maximum.reduceat(parent, starts)
+    of_track = np.repeat(np.arange(len(starts)), ends - starts + 1)
+    odd = np.flatnonzero((parent != NONE) & (parent != mothers[of_track]))
+    if odd.size:
+        k = int(odd[0])
+        raise InputError(
+            f"{given.source}: cell {cell[k]} of colony {colony[k]} has two parents, {parent[k]} and"
+            f" {mothers[of_track[k]]}."
+        )
+    over = {c: float(hours[colony == c].max()) for c in np.unique(colony).tolist()}
+    end = np.array([over[c] for c in colony[starts].tolist()])
+    return _checked(given.source, Tracks(
+        colony[starts], cell[starts], mothers, hours[starts], hours[ends], sizes[starts],
+        sizes[ends], end,
+    ))  # fmt: skip
+
+
+def challenge_tracks(path: str | Path, interval: float) -> Tracks:
+    """The tracks of a file of the Cell Tracking Challenge: label, first and last frame, parent (0:
+    none). interval: h between frames."""
+    path = checks.file_path("Lineage.from_ctc(path)", path)
+    checks.number("Lineage.from_ctc(interval)", interval, above=0.0)
+    if path.is_dir() or not path.is_file():
+        rule = "the file of tracks, such as 01_GT/TRA/man_track.txt or 01_RES/res_track.txt"
+        raise checks.input_error("Lineage.from_ctc(path)", str(path), rule)
+    try:
+        rows = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
+        numbers = np.array([[int(x) for x in row] for row in rows if row], np.int64)
+    except (ValueError, UnicodeDecodeError) as error:
+        rule = "four whole numbers in each line: label, first frame, last frame, parent"
+        raise InputError(f"{path} must have {rule} ({error}).") from error
+    if numbers.ndim != 2 or numbers.shape[1] != 4:
+        raise InputError(f"{path} must have four whole numbers in each line: L B E P.")
+    cell, first, last, parent = numbers.T
+    none, nothing = np.full(len(cell), np.nan), np.zeros(len(cell), np.int64)
+    if len(np.unique(cell)) < len(cell) or (last < first).any():
+        raise InputError(f"{path}: each label must be there once, and end after it begins.")
+    return _checked(str(path), Tracks(
+        nothing, cell, np.where(parent == 0, NONE, parent), interval * first, interval * last,
+        none, none, np.full(len(cell), interval * last.max()),
+    ))  # fmt: skip
+
+
+def _whole(given: tables.Table, column: str) -> np.ndarray:
+    """A column of whole numbers from 0, (N,) int64."""
+    if column not in given.columns:
+        raise given.missing(column)
+    numbers = given.numbers(column)
+    bad = np.flatnonzero((numbers != np.round(numbers)) | (numbers < 0))
+    if bad.size:
+        row = int(bad[0])
+        rule = "a whole number from 0"
+        raise InputError(f"{given.place(row)}, column {column!r}: {numbers[row]:g} must be {rule}.")
+    return numbers.astype(np.int64)
+
+
+def _parents(given: tables.Table, column: str, cell: np.ndarray) -> np.ndarray:
+    """The parent of each row, −1 where none is named: by nothing, by a number below 0, or by 0
+    where no cell is 0."""
+    if column not in given.columns:
+        raise given.missing(column, "Give the cell from which each descends, −1 of those of none.")
+    values = []
+    for row, text in enumerate(given.columns[column].tolist()):
+        if text is None or text == "" or text != text:
+            values.append(NONE)
+            continue
+        try:
+            number = float(text)
+        except (TypeError, ValueError):
+            number = np.nan
+        if number != np.round(number):
+            rule = "a whole number, or empty where it has no parent"
+            raise InputError(f"{given.place(row)}, column {column!r}: {text!r} must be {rule}.")
+        values.append(int(number) if number > 0 or (number == 0 and (cell == 0).any()) else NONE)
+    return np.array(values, np.int64)
+
+
+def _checked(source: str, tracks: Tracks) -> Tracks:
+    """Sorted by their beginnings. Raises InputError for a parent that is no cell, or that begins no
+    earlier than its daughter; warns of cells with one daughter or with more than two."""
+    order = np.argsort(tracks.first, kind="stable")
+    found = Tracks(*(getattr(tracks, name)[order] for name in tracks.__dataclass_fields__))
+    place = {key: k for k, key in enumerate(zip(found.colony.tolist(), found.cell.tolist(),
+                                                strict=True))}  # fmt: skip
+    daughters = np.zeros(len(order), np.int64)
+    for k in np.flatnonzero(found.parent != NONE).tolist():
+        mother = place.get((int(found.colony[k]), int(found.parent[k])))
+        if mother is None:
+            raise InputError(
+                f"{source}: cell {found.cell[k]} has the parent {found.parent[k]}, which is no cell"
+                " of its colony. Give −1, 0 or nothing where it is not known."
+            )
+        if found.first[mother] >= found.first[k]:
+            raise InputError(
+                f"{source}: cell {found.cell[k]} begins at {found.first[k]:g} h, no later than its"
+                f" parent {found.parent[k]}."
+            )
+        daughters[mother] += 1
+    for count, what in ((daughters == 1, "one daughter"), (daughters > 2, "more than two")):
+        if count.any():
+            some = ", ".join(map(str, found.cell[count][:8].tolist()))
+            warn(
+                f"{source}: {int(count.sum())} cells have {what} (such as {some}): tracks may be"
+                " cut or wrongly joined there. They count as divided."
+            )
+    return found
