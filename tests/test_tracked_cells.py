@@ -44,9 +44,7 @@ def test_it_is_a_tree_as_that_of_a_run():
     cells = tree.to_pandas()
     assert cells.pole_age.tolist() == [-1] * 5  # a movie does not tell poles
     assert cells.fate.tolist() == tree.fate.tolist()
-    with pytest.raises(
-        InputError, match=r"no results file: .* cells \[4, 2, 1\]"
-    ):
+    with pytest.raises(InputError, match=r"no results file: .* cells \[4, 2, 1\]"):
         tree.course(4)
 
 
@@ -99,6 +97,10 @@ def test_units_names_and_widths():
         ({"parent": [0, 0, 1, 1, 1, 1, 2, 2, 3, 2]}, "cell 4 of colony 0 has two parents, "),
         ({"time_min": [20] + [r[2] for r in ROWS[1:]], "cell": [1, 6] + [r[0] for r in ROWS[2:]]},
          "cell 2 begins at 0.333333 h, no later than its parent 1"),
+        ({"cell": [2**40] + [r[0] for r in ROWS[1:]]}, r"from 0, below 2\*\*40"),
+        ({"colony": ["a"] * 10}, "'a' is a name, and a number is needed.*factorize"),
+        ({"time_min": [0, 20] + [r[2] for r in ROWS[2:]]},
+         "cell 1 is there at 0.333333 h, and its daughter 2 from 0.333333 h on.*column colony"),
         ({"length_um": [-1.0] * 10}, "-1 µm is no length of a centreline"),
         ({"width": 2.5}, "-0.5 µm is no length of a centreline"),
         ({"width": 0.0}, r"width\) = 0"),
@@ -111,6 +113,29 @@ def test_wrong_tables(change, words):
     given = {k: v for k, v in (table() | change).items() if v is not None and k not in options}
     with pytest.raises(InputError, match=words):
         tf.Lineage.from_table(given, **options)
+
+
+def test_a_length_that_is_missing_leaves_the_cell_there():
+    given = table()
+    given["length_um"] = [2.0, None, *given["length_um"][2:]]
+    tree, whole = tf.Lineage.from_table(given), tf.Lineage.from_table(table())
+    assert np.isnan(tree.end_length[0]) and tree.ended == pytest.approx(whole.ended, nan_ok=True)
+    assert tree.end_length[1:3] == pytest.approx(whole.end_length[1:3])
+
+
+def test_a_gap_between_a_mother_and_her_daughters_is_told():
+    rows = [r for r in ROWS if r[0] != 1 or r[2] == 0]
+    with pytest.warns(UserWarning, match="2 cells begin later than a frame after their parent's"):
+        tf.Lineage.from_table(table(rows))
+
+
+def test_founders_and_late_movies_have_clones_and_branches_of_their_own():
+    rows = [(1, 0, 0, 2.0), (1, 0, 60, 2.0), (2, 0, 0, 2.0), (2, 0, 60, 2.0)]
+    tree = tf.Lineage.from_table(table(rows))
+    assert tree.clone_sizes() == {1: 1, 2: 1} == tree.clone_sizes(time=0.0)
+    late = [(1, 0, 0, 2.0), (1, 0, 60, 2.0), (1, 0, 300, 2.0), (1, 0, 600, 2.0)]
+    both = tf.Lineage.from_table(table(late, colony=[0, 0, 1, 1]))
+    assert both.to_newick(0) == "colony0.cell1:1;\n" and both.to_newick(1) == "colony1.cell1:5;\n"
 
 
 def test_cells_with_one_daughter_are_told():

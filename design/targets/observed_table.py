@@ -16,7 +16,10 @@ from torchfilm import checks, tables
 
 COLONY, FRAME = "colony", "frame"
 # columns of times; each colony has one
-TIMES = ("time", "time_h", "time_min", "time_s", "timepoint", "t")
+TIMES = (
+    "time", "time_h", "time_min", "time_s", "timepoint", "t", "t_h", "t_min", "t_s", "hour",
+    "hours", "minute", "minutes",
+)  # fmt: skip
 KIND = {"x": "length", "y": "length", "length": "length", "angle": "angle", "age": "time"}
 ROUNDED = 1e-3  # share by which a time may differ from that of a column
 

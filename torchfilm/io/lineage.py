@@ -84,6 +84,8 @@ class Lineage:
         )
         self.fate = np.full(len(cell), "alive", dtype="<U8")
         self.cell_type = np.full(len(cell), -1)
+        # h: of the first frame of each cell, and of the last one of its colony
+        self._from, self._until = np.full(len(cell), begin), np.full(len(cell), now)
         self._order = np.argsort(_pair(colony, cell))
         self._keys = _pair(colony, cell)[self._order]
 
@@ -108,6 +110,7 @@ class Lineage:
         then = lambda t: np.interp(t["step"], steps, times)  # all that earlier versions have
         hours = lambda t: np.where(np.isnan(t["time"]), then(t), t["time"])
         made.born = np.concatenate([founded, hours(births)])
+        made._from = np.where(np.isnan(made.born), made.begin, made.born)
         lengths = np.where(np.isnan(founded), np.nan, first["length"])
         made.birth_length = np.concatenate([lengths, births["length"]])
         at = made._rows(ends["colony_id"], ends["uid"])
@@ -116,8 +119,7 @@ class Lineage:
             raise InputError(
                 f"{results.path} is damaged: it has ends of no known fate. Use another copy of it."
             )
-        made.fate[at] = np.asarray(FATES)[ends["fate"]]
-        made.end_length[at] = ends["length"]
+        made.fate[at], made.end_length[at] = np.asarray(FATES)[ends["fate"]], ends["length"]
         living = results.frame(last)
         if "cell_type" in living:
             alive = made._rows(results.colony_id[living["colony"]], living["uid"])
@@ -151,8 +153,7 @@ class Lineage:
         begin no earlier than their daughters, and two rows of a cell at one time.
         """
         units = tables.Units(pixel_size, length_unit, None, time_unit)
-        source = str(table) if isinstance(table, (str, Path)) else "the table"
-        return Lineage._of_tracks(table_tracks(table, columns or {}, units, width), source)
+        return Lineage._of_tracks(table_tracks(table, columns or {}, units, width), "the table")
 
     @staticmethod
     def from_ctc(path: str | Path, *, interval: float) -> Lineage:
@@ -167,7 +168,7 @@ class Lineage:
             begin=float(tracks.first.min()), now=float(tracks.end.max()),
             known=np.unique(tracks.colony).tolist(),
         )  # fmt: skip
-        known = tracks.parent >= 0
+        known, made._from, made._until = tracks.parent >= 0, tracks.first, tracks.end
         made.born = np.where(known, tracks.first, np.nan)
         made.birth_length = np.where(known, tracks.birth_length, np.nan)
         mothers = made._mothers
@@ -277,7 +278,7 @@ class Lineage:
             when = checks.number("clone_sizes(time)", time, least=self.begin, most=self.now)
         mine = self.colony == self.colony_of_run(colony)
         # a mother ends when her daughters are born; what has an unknown end is gone
-        there = (self.born <= when) & ((self.fate == "alive") | (self.ended > when))
+        there = (self._from <= when) & ((self.fate == "alive") | (self.ended > when))
         alive = self.founder[mine & there]
         return {int(f): int((alive == f).sum()) for f in np.unique(self.founder[mine])}
 
@@ -321,8 +322,7 @@ class Lineage:
         checks.choice("alive", alive, (True, False))
         kept = self._leading_to_life if alive else np.ones(len(self), bool)
         roots = [row for row in self._roots(colony) if kept[row]]
-        born = np.where(np.isnan(self.born), self.begin, self.born)
-        lived = np.where(np.isnan(self.ended), self.now, self.ended) - born
+        lived = np.where(np.isnan(self.ended), self._until, self.ended) - self._from
         name = lambda row: "colony{}.cell{}".format(*self._node(row))
         below = {row: [d for d in of if kept[d]] for row, of in self._daughters.items()}
         return "".join(f"{newick(row, below, lived, name)};\n" for row in roots)

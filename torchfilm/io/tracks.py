@@ -16,6 +16,8 @@ from torchfilm.tools.warn_once import warn
 
 MEANT = ("cell", "parent", "colony", "time", "length")
 NONE = -1  # of a parent
+GAP = 1.5  # intervals between a mother and her daughter, above which frames are missing
+MOST_CELLS, MOST_COLONIES = 2**40, 2**20  # of which a tree tells numbers apart
 LOST = "lost"  # the fate of a track that ends before the movie, without daughters
 
 
@@ -56,14 +58,16 @@ def table_tracks(
     if width is not None:
         checks.number("Lineage.from_table(width)", width, above=0.0)
     if length is not None:
-        sizes = length[2] * given.numbers(length[0]) - (width or 0.0)
+        sizes = length[2] * _with_gaps(given, length[0]) - (width or 0.0)
         if (sizes < 0.0).any():
             row = int(np.flatnonzero(sizes < 0.0)[0])
             raise InputError(f"{given.place(row)}: {sizes[row]:g} µm is no length of a centreline.")
     units.check_used(used)
-    cell = _whole(given, columns.get("cell", "cell"))
+    cell = _whole(given, columns.get("cell", "cell"), MOST_CELLS)
     named = columns.get("colony", "colony")
-    colony = _whole(given, named) if named in given.columns else np.zeros(given.rows, np.int64)
+    colony = np.zeros(given.rows, np.int64)
+    if named in given.columns:
+        colony = _whole(given, named, MOST_COLONIES)
     if "colony" in columns and named not in given.columns:
         raise given.missing(named)
     parent = _parents(given, columns.get("parent", "parent"), cell)
@@ -95,7 +99,7 @@ def table_tracks(
     return _checked(given.source, Tracks(
         colony[starts], cell[starts], mothers, hours[starts], hours[ends], sizes[starts],
         sizes[ends], end,
-    ))  # fmt: skip
+    ), _interval(colony, hours))  # fmt: skip
 
 
 def challenge_tracks(path: str | Path, interval: float) -> Tracks:
@@ -121,20 +125,55 @@ def challenge_tracks(path: str | Path, interval: float) -> Tracks:
     return _checked(str(path), Tracks(
         nothing, cell, np.where(parent == 0, NONE, parent), interval * first, interval * last,
         none, none, np.full(len(cell), interval * last.max()),
-    ))  # fmt: skip
+    ), interval)  # fmt: skip
 
 
-def _whole(given: tables.Table, column: str) -> np.ndarray:
+def _interval(colony: np.ndarray, hours: np.ndarray) -> float:
+    """The usual time between frames of a colony, h; inf where each has one."""
+    frames = np.unique(np.stack([colony.astype(float), hours], 1), axis=0)
+    apart = np.diff(frames[:, 1])[np.diff(frames[:, 0]) == 0]
+    return float(np.median(apart)) if len(apart) else np.inf
+
+
+def _with_gaps(given: tables.Table, column: str) -> np.ndarray:
+    """A column of numbers, NaN where one is missing: the row tells that the cell was there."""
+    values = given.columns[column]
+    empty = np.array(
+        [v is None or v != v or v in ("", "nan", "NaN", "NA") for v in values.tolist()]
+    )
+    found = np.full(given.rows, np.nan)
+    if not empty.all():
+        found[~empty] = given.take(~empty).numbers(column)
+    return found
+
+
+def _whole(given: tables.Table, column: str, below: int) -> np.ndarray:
     """A column of whole numbers from 0, (N,) int64."""
     if column not in given.columns:
         raise given.missing(column)
+    values = given.columns[column]
+    if values.dtype.kind in "OU" and any(isinstance(v, str) and _is_name(v) for v in values):
+        name = next(v for v in values if isinstance(v, str) and _is_name(v))
+        raise InputError(
+            f"{given.source}, column {column!r}: {str(name)!r} is a name, and a number is needed, such"
+            f" as pandas.factorize(table[{column!r}])[0] makes of names."
+        )
     numbers = given.numbers(column)
-    bad = np.flatnonzero((numbers != np.round(numbers)) | (numbers < 0))
+    bad = np.flatnonzero((numbers != np.round(numbers)) | (numbers < 0) | (numbers >= below))
     if bad.size:
         row = int(bad[0])
-        rule = "a whole number from 0"
+        rule = f"a whole number from 0, below 2**{below.bit_length() - 1}"
         raise InputError(f"{given.place(row)}, column {column!r}: {numbers[row]:g} must be {rule}.")
     return numbers.astype(np.int64)
+
+
+def _is_name(text: str) -> bool:
+    """Whether a text is none of a number."""
+    try:
+        float(text)
+    except ValueError:
+        return bool(text.strip())
+    return False
 
 
 def _parents(given: tables.Table, column: str, cell: np.ndarray) -> np.ndarray:
@@ -158,14 +197,15 @@ def _parents(given: tables.Table, column: str, cell: np.ndarray) -> np.ndarray:
     return np.array(values, np.int64)
 
 
-def _checked(source: str, tracks: Tracks) -> Tracks:
-    """Sorted by their beginnings. Raises InputError for a parent that is no cell, or that begins no
-    earlier than its daughter; warns of cells with one daughter or with more than two."""
+def _checked(source: str, tracks: Tracks, interval: float) -> Tracks:
+    """Sorted by their beginnings. interval: h, between frames. Raises InputError for a parent that
+    is no cell, or that is there as its daughter begins, or later; warns of cells with one daughter
+    or with more than two, and of gaps between mothers and daughters."""
     order = np.argsort(tracks.first, kind="stable")
     found = Tracks(*(getattr(tracks, name)[order] for name in tracks.__dataclass_fields__))
     place = {key: k for k, key in enumerate(zip(found.colony.tolist(), found.cell.tolist(),
                                                 strict=True))}  # fmt: skip
-    daughters = np.zeros(len(order), np.int64)
+    daughters, gaps = np.zeros(len(order), np.int64), 0
     for k in np.flatnonzero(found.parent != NONE).tolist():
         mother = place.get((int(found.colony[k]), int(found.parent[k])))
         if mother is None:
@@ -178,7 +218,14 @@ def _checked(source: str, tracks: Tracks) -> Tracks:
                 f"{source}: cell {found.cell[k]} begins at {found.first[k]:g} h, no later than its"
                 f" parent {found.parent[k]}."
             )
+        if found.last[mother] >= found.first[k]:
+            raise InputError(
+                f"{source}: cell {found.parent[k]} is there at {found.last[mother]:g} h, and its"
+                f" daughter {found.cell[k]} from {found.first[k]:g} h on. Are cells of several"
+                " movies one? A column colony tells them apart."
+            )
         daughters[mother] += 1
+        gaps += found.first[k] - found.last[mother] > GAP * interval
     for count, what in ((daughters == 1, "one daughter"), (daughters > 2, "more than two")):
         if count.any():
             some = ", ".join(map(str, found.cell[count][:8].tolist()))
@@ -186,4 +233,9 @@ def _checked(source: str, tracks: Tracks) -> Tracks:
                 f"{source}: {int(count.sum())} cells have {what} (such as {some}): tracks may be"
                 " cut or wrongly joined there. They count as divided."
             )
+    if gaps:
+        warn(
+            f"{source}: {gaps} cells begin later than a frame after their parent's last one: when"
+            " they were born, and what lengths they had then, is not known so well."
+        )
     return found
