@@ -155,8 +155,8 @@ def _whole(given: tables.Table, column: str, below: int) -> np.ndarray:
     if values.dtype.kind in "OU" and any(isinstance(v, str) and _is_name(v) for v in values):
         name = next(v for v in values if isinstance(v, str) and _is_name(v))
         raise InputError(
-            f"{given.source}, column {column!r}: {str(name)!r} is a name, and a number is needed, such"
-            f" as pandas.factorize(table[{column!r}])[0] makes of names."
+            f"{given.source}, column {column!r}: {str(name)!r} is a name, and a number is needed,"
+            f" such as pandas.factorize(table[{column!r}])[0] makes of names."
         )
     numbers = given.numbers(column)
     bad = np.flatnonzero((numbers != np.round(numbers)) | (numbers < 0) | (numbers >= below))
