@@ -153,18 +153,18 @@ class Lineage:
         begin no earlier than their daughters, and two rows of a cell at one time.
         """
         units = tables.Units(pixel_size, length_unit, None, time_unit)
-        return Lineage._of_tracks(table_tracks(table, columns or {}, units, width), "the table")
+        return Lineage._of_tracks(table_tracks(table, columns or {}, units, width))
 
     @staticmethod
     def from_ctc(path: str | Path, *, interval: float) -> Lineage:
         """Cells in a file of tracks of the Cell Tracking Challenge, such as man_track.txt, without
         their lengths. interval: h between frames. Else as `from_table`."""
-        return Lineage._of_tracks(challenge_tracks(path, interval), str(path))
+        return Lineage._of_tracks(challenge_tracks(path, interval))
 
     @staticmethod
-    def _of_tracks(tracks: Tracks, source: str) -> Lineage:
+    def _of_tracks(tracks: Tracks) -> Lineage:
         made = Lineage(
-            tracks.colony, tracks.cell, tracks.parent, source=source,
+            tracks.colony, tracks.cell, tracks.parent, source=tracks.source,
             begin=float(tracks.first.min()), now=float(tracks.end.max()),
             known=np.unique(tracks.colony).tolist(),
         )  # fmt: skip

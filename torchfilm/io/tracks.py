@@ -4,7 +4,7 @@ the Cell Tracking Challenge."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +25,12 @@ LOST = "lost"  # the fate of a track that ends before the movie, without daughte
 class Tracks:
     """One row for each track, sorted by the hour at which it begins.
 
-    colony, cell, parent (−1: none known): (N,) int64. first, last: h, of its first and last frame.
-    birth_length, end_length: µm, in these frames, NaN where lengths are not known. end: h, of the
-    last frame of its movie.
+    source: the file or the table, for messages. colony, cell, parent (−1: none known): (N,) int64.
+    first, last: h, of its first and last frame. birth_length, end_length: µm, in these frames, NaN
+    where lengths are not known. end: h, of the last frame of its movie.
     """
 
+    source: str
     colony: np.ndarray
     cell: np.ndarray
     parent: np.ndarray
@@ -54,23 +55,32 @@ def table_tracks(
         raise given.missing("time_h", "Give the hour of each row, as time_h or time_min.")
     hours = time[2] * given.numbers(time[0])
     length = given.quantity("length", "length", columns, units, used)
-    sizes: Any = np.full(given.rows, np.nan)
+    sizes = (
+        np.full(given.rows, np.nan) if length is None else length[2] * _with_gaps(given, length[0])
+    )
     if width is not None:
-        checks.number("Lineage.from_table(width)", width, above=0.0)
-    if length is not None:
-        sizes = length[2] * _with_gaps(given, length[0]) - (width or 0.0)
-        if (sizes < 0.0).any():
-            row = int(np.flatnonzero(sizes < 0.0)[0])
-            raise InputError(f"{given.place(row)}: {sizes[row]:g} µm is no length of a centreline.")
+        sizes = sizes - checks.number("Lineage.from_table(width)", width, above=0.0)
+    if (sizes < 0.0).any():
+        row = int(np.flatnonzero(sizes < 0.0)[0])
+        raise InputError(f"{given.place(row)}: {sizes[row]:g} µm is no length of a centreline.")
     units.check_used(used)
     cell = _whole(given, columns.get("cell", "cell"), MOST_CELLS)
-    named = columns.get("colony", "colony")
     colony = np.zeros(given.rows, np.int64)
-    if named in given.columns:
-        colony = _whole(given, named, MOST_COLONIES)
-    if "colony" in columns and named not in given.columns:
-        raise given.missing(named)
+    if "colony" in {**given.columns, **columns}:
+        colony = _whole(given, columns.get("colony", "colony"), MOST_COLONIES)
     parent = _parents(given, columns.get("parent", "parent"), cell)
+    return _of_rows(given.source, colony, cell, parent, hours, sizes)
+
+
+def _of_rows(
+    source: str,
+    colony: np.ndarray,
+    cell: np.ndarray,
+    parent: np.ndarray,
+    hours: np.ndarray,
+    sizes: np.ndarray,
+) -> Tracks:
+    """The tracks of rows, (R,) each, in any order."""
     order = np.lexsort((hours, cell, colony))
     colony, cell, parent = colony[order], cell[order], parent[order]
     hours, sizes = hours[order], sizes[order]
@@ -80,7 +90,7 @@ def table_tracks(
     if twice.size:
         k = int(twice[0])
         raise InputError(
-            f"{given.source}: cell {cell[k]} of colony {colony[k]} has two rows at {hours[k]:g} h."
+            f"{source}: cell {cell[k]} of colony {colony[k]} has two rows at {hours[k]:g} h."
         )
     starts = np.flatnonzero(begins)
     ends = np.append(starts[1:], len(cell)) - 1
@@ -91,13 +101,13 @@ def table_tracks(
     if odd.size:
         k = int(odd[0])
         raise InputError(
-            f"{given.source}: cell {cell[k]} of colony {colony[k]} has two parents, {parent[k]} and"
+            f"{source}: cell {cell[k]} of colony {colony[k]} has two parents, {parent[k]} and"
             f" {mothers[of_track[k]]}."
         )
     over = {c: float(hours[colony == c].max()) for c in np.unique(colony).tolist()}
     end = np.array([over[c] for c in colony[starts].tolist()])
-    return _checked(given.source, Tracks(
-        colony[starts], cell[starts], mothers, hours[starts], hours[ends], sizes[starts],
+    return _checked(Tracks(
+        source, colony[starts], cell[starts], mothers, hours[starts], hours[ends], sizes[starts],
         sizes[ends], end,
     ), _interval(colony, hours))  # fmt: skip
 
@@ -122,9 +132,9 @@ def challenge_tracks(path: str | Path, interval: float) -> Tracks:
     none, nothing = np.full(len(cell), np.nan), np.zeros(len(cell), np.int64)
     if len(np.unique(cell)) < len(cell) or (last < first).any():
         raise InputError(f"{path}: each label must be there once, and end after it begins.")
-    return _checked(str(path), Tracks(
-        nothing, cell, np.where(parent == 0, NONE, parent), interval * first, interval * last,
-        none, none, np.full(len(cell), interval * last.max()),
+    return _checked(Tracks(
+        str(path), nothing, cell, np.where(parent == 0, NONE, parent), interval * first,
+        interval * last, none, none, np.full(len(cell), interval * last.max()),
     ), interval)  # fmt: skip
 
 
@@ -197,12 +207,13 @@ def _parents(given: tables.Table, column: str, cell: np.ndarray) -> np.ndarray:
     return np.array(values, np.int64)
 
 
-def _checked(source: str, tracks: Tracks, interval: float) -> Tracks:
+def _checked(tracks: Tracks, interval: float) -> Tracks:
     """Sorted by their beginnings. interval: h, between frames. Raises InputError for a parent that
     is no cell, or that is there as its daughter begins, or later; warns of cells with one daughter
     or with more than two, and of gaps between mothers and daughters."""
-    order = np.argsort(tracks.first, kind="stable")
-    found = Tracks(*(getattr(tracks, name)[order] for name in tracks.__dataclass_fields__))
+    source, order = tracks.source, np.argsort(tracks.first, kind="stable")
+    columns = (f.name for f in fields(tracks) if f.name != "source")
+    found = replace(tracks, **{name: getattr(tracks, name)[order] for name in columns})
     place = {key: k for k, key in enumerate(zip(found.colony.tolist(), found.cell.tolist(),
                                                 strict=True))}  # fmt: skip
     daughters, gaps = np.zeros(len(order), np.int64), 0
