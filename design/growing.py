@@ -62,7 +62,8 @@ def grow(
         yield from failed
         if bool(gone.all()):
             return
-        state = _keep(state, ~gone)
+        births = state.births  # which a note may tell of, and a part of a state does not know
+        state = _keep(state, ~gone).replace(births=births)
         found = note(state)
         if found is not None:
             row = found.new_full((count, *found.shape[1:]), torch.nan)

@@ -210,7 +210,7 @@ def _grow_and_score(
             places = _places(numbers, copies)
             first, ids = places[:, 0], numbers[places[:, 0]].tolist()
             score = _scores(task.target, event)[first]
-            score, why = _below_failed(task.target, score)
+            score, why = _below_failed(task.target, score, event, places[:, 0])
             reasons |= {divmod(ids[k], replicates): words for k, words in why.items()}
             unfit = np.array(_unfit(task, event.state, size))[first].tolist()
             reasons |= {divmod(k, replicates): w for k, w in zip(ids, unfit, strict=True) if w}
@@ -273,20 +273,32 @@ def _of_replicates(task: Task, found: WorkResult) -> WorkResult:
     )  # fmt: skip
 
 
-def _below_failed(target: Target, score: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:
-    """Losses (n,) that a search can compare, NaN for the others, and why, by their places: a colony
-    that grew must not look worse than one that failed."""
+def _below_failed(
+    target: Target, score: np.ndarray, event: FinishedColonies, rows: np.ndarray
+) -> tuple[np.ndarray, dict[int, str]]:
+    """Losses (n,) of some rows (n,) of finished colonies that a search can compare, NaN for the
+    others, and why, by their places: a colony that grew must not look worse than one that
+    failed."""
     why = {}
     for k, number in enumerate(score.tolist()):
         if not math.isfinite(number):
-            of_data = ": one of the measures that it compares was not a number"
-            why[k] = f"the target's loss was {number}{of_data if target.evidence else ''}"
+            why[k] = f"the target's loss was {number}{_undefined(target, event, int(rows[k]))}"
         elif number > target.failed:
             why[k] = (
                 f"the target's loss was {number:g}, above {target.failed:g}, that of a failed"
                 " colony. Give your target a class attribute `failed` above all its losses"
             )
     return np.where([k in why for k in range(len(score))], np.nan, score), why
+
+
+def _undefined(target: Target, event: FinishedColonies, row: int) -> str:
+    """The first measure of a colony that data are compared with and that is not a number."""
+    known = target.evidence
+    for name, found in target.measures(event.state, event.history).items() if known else ():
+        if name in known and found[row].isnan() and target.concerns(name, event.state)[row]:
+            reason = target.why_undefined(name)
+            return f": {name} was not a number{f', as {reason}' if reason else ''}"
+    return ""
 
 
 def _unfit(task: Task, state: tf.State, size: float) -> list[str]:

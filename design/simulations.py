@@ -221,8 +221,11 @@ def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.nda
     shape = (len(item.rows), task.replicates, task.conditions, len(columns))
     each_own = found.reshape(shape)[:, :, places(observed), columns]
     means = _means(each_own, np.array(averaged(observed, task.replicates)))
+    names = observed.plan.names
     for k in np.flatnonzero(~np.isfinite(means).all(1)).tolist():
-        reasons.setdefault(k, "a statistic is not finite")
+        name = names[int(np.flatnonzero(~np.isfinite(means[k]))[0])]
+        why = observed.why_undefined(name)
+        reasons.setdefault(k, f"{name} is not a number{f', as {why}' if why else ''}")
     size = counts.reshape(len(item.rows), each).mean(1).tolist()
     return [(row, means[k], size[k], reasons.get(k, "")) for k, row in enumerate(item.rows)]
 

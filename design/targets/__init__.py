@@ -10,6 +10,7 @@ from design.targets.lasting import Lasting
 from design.targets.measured import Measured
 from design.targets.observed import Observed
 from design.targets.observed_course import ObservedCourse
+from design.targets.observed_cycles import ObservedCycles
 from design.targets.oscillation import Oscillation
 from design.targets.patterns import DomainSize, OnFraction
 from design.targets.profiles import Bands, ProfileTarget, Ring
@@ -30,6 +31,7 @@ __all__ = [
     "Measured",
     "Observed",
     "ObservedCourse",
+    "ObservedCycles",
     "OnFraction",
     "Oscillation",
     "ProfileTarget",

@@ -31,7 +31,7 @@ from torchfilm import checks, tables
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-NOTES = 2  # columns of a birth note
+NOTES, OF_A_FRAME = 2, ColonyStatistics | MeasureStatistics  # columns of a birth note; plans
 
 
 class JoinedStatistics(ABC):
@@ -343,7 +343,7 @@ class ObservedCourse(Observed):
 
     def why_undefined(self, measure: str) -> str:
         known = measure in self.evidence
-        return "the colony had no cells, or ended before that time" if known else ""
+        return "the colony had ended, or had no cells, or the measure was NaN" if known else ""
 
     @property
     def mark(self) -> str:
@@ -392,7 +392,7 @@ def _checked(frames: object) -> tuple[Observed, ...]:
         raise checks.input_error("ObservedCourse.frames", frames, rule)
     found: list[Observed] = []
     for k, frame in enumerate(map(as_data, frames)):
-        if not isinstance(frame, Observed) or isinstance(frame, ObservedCourse):
+        if not (isinstance(frame, Observed) and isinstance(frame.plan, OF_A_FRAME)):
             rule = "an Observed or a Measured"
             raise checks.input_error(f"ObservedCourse.frames[{k}]", frame, rule)
         if frame.time is None:

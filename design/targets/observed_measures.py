@@ -79,6 +79,9 @@ class ObservedMeasures(Observed):
     def why_rough(self, state: tf.State) -> str:
         return self.measured.why_rough(state)
 
+    def why_undefined(self, measure: str) -> str:
+        return ""  # the function says it
+
     def statistics(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         """The measures of each colony, (B, K) float64, with their gradients."""
         return self.measured.found(state)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
+from torch import Tensor
 
 import torchfilm as tf
 from design.targets.statistics import LOG_CELLS, ColonyStatistics, SeenCells, resampled_spread
@@ -23,28 +26,39 @@ def values_of(
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """The mean of each statistic over the colonies, (K,), and its spread."""
     each = plan.of(cells)
-    count = len(cells.counts)
-    resampled = [resampled_spread(cells, plan, k) for k in range(count)]
-    spread = torch.stack(resampled).square().mean(0).sqrt()
-    if count >= ENOUGH:
+    resampled = [resampled_spread(cells, plan, k) for k in range(len(cells.counts))]
+    drawn = torch.stack(resampled).square().mean(0).sqrt()
+    spread = spread_of(each, drawn, plan.groups, float(cells.counts.double().mean()))
+    return tuple(each.mean(0).tolist()), tuple(spread.tolist())
+
+
+def spread_of(
+    each: Tensor, drawn: Tensor, groups: Mapping[str, tuple[str, ...]], size: float = 1.0
+) -> Tensor:
+    """The spread of each statistic, (K,) above 0. each: those of the colonies, (C, K); drawn: the
+    spread within a colony, (K,); groups: the names of statistics that are of one kind; size: how
+    many cells a colony has."""
+    names = [name for kind in groups.values() for name in kind]
+    spread = drawn
+    if len(each) >= ENOUGH:
         between = each.std(0)
         # of few colonies it is small by chance, and it contains that of drawing cells; but
         # divisions in step make numbers of cells more alike than independent ones would
-        at = plan.names.index(LOG_CELLS) if LOG_CELLS in plan.names else None
         spread = torch.maximum(spread, between)
-        if at is not None:
+        if LOG_CELLS in names:
+            at = names.index(LOG_CELLS)
             spread[at] = between[at]
     least = torch.cat([
-        each[:, [plan.names.index(n) for n in names]].abs().max().mul(FINEST).expand(len(names))
-        for names in plan.groups.values()
+        each[:, [names.index(n) for n in kind]].abs().max().mul(FINEST).expand(len(kind))
+        for kind in groups.values()
     ])  # fmt: skip
-    if plan.names[0] == LOG_CELLS:
-        least[0] = max(COUNT, PART / float(cells.counts.double().mean()))
-    alike = torch.tensor([VARIED if n.endswith("_cv") else 0.0 for n in plan.names])
+    if names[0] == LOG_CELLS:
+        least[0] = max(COUNT, PART / size)
+    alike = torch.tensor([VARIED if n.endswith("_cv") else 0.0 for n in names])
     least = torch.maximum(least, alike.to(least))
     spread = torch.maximum(spread, least)
-    spread = torch.where(spread > 0, spread, 1.0)  # a reporter that is dark in all cells
-    return tuple(each.mean(0).tolist()), tuple(spread.tolist())
+    # a reporter that is dark in all cells
+    return torch.where(spread > 0, spread, 1.0)
 
 
 def check_relative(cells: SeenCells, plan: ColonyStatistics) -> None:

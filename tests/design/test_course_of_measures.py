@@ -108,8 +108,10 @@ def test_a_measure_that_was_no_number_fails_its_colony():
     course = of({"late": late_only}, {"late": [0.4, 0.6, 0.9]}, {"late": 0.1})
     found = objective_of(colony, MAKE, course, **OPTIONS).evaluate(np.array([[0.5]]))
     assert found.loss[0] == course.failed
-    assert found.reasons[0, 0].endswith("was nan: one of the measures that it compares was not a"
-                                        " number")  # fmt: skip
+    assert found.reasons[0, 0] == (
+        "the target's loss was nan: late at 0.5 h was not a number, as the colony had ended, or had"
+        " no cells, or the measure was NaN"
+    )
 
 
 def test_a_first_look_does_not_compare_the_last_time():

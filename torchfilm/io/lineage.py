@@ -1,5 +1,4 @@
-"""The lineage of a run as a tree: who descends from whom, when each cell was born and how it
-ended."""
+"""The lineage of a run as a tree: who descends from whom, when each was born and how it ended."""
 
 from __future__ import annotations
 
@@ -55,11 +54,11 @@ class Lineage:
     birth_length, end_length: of the centreline, µm, when it was born and ended; NaN where that hour
     is NaN, and in files of earlier versions but for founders · cell_type: when it ended, or in the
     last frame while it lives; −1 in a scene without types, and of ends in files of earlier versions
-    · founder: uid of the first of its line in the file.
+    · founder: uid of the first of its line in the file. interval: h, between the frames of a movie,
+    0 of a run, whose births and ends are noted at every step.
 
     Cells are named by uid, and in a run of several colonies by `colony`, an id, too. `course` reads
-    the file, which must be open. Raises InputError for cells and colonies that the run does not
-    have.
+    the file, which must be open. Raises InputError for cells and colonies that it does not have.
     """
 
     def __init__(
@@ -77,7 +76,7 @@ class Lineage:
         """Cells (N,), mothers before daughters, of which nothing else is known. source: for
         messages; begin, now: h, of the first and last frame; known: the ids of all colonies."""
         self._results, self._path, self._known = results, source, list(known)
-        self.begin, self.now = begin, now
+        self.begin, self.now, self.interval = begin, now, 0.0
         self.colony, self.cell, self.parent = colony, cell, parent
         self.born, self.ended, self.birth_length, self.end_length = (
             np.full(len(cell), np.nan) for _ in range(4)
@@ -168,7 +167,8 @@ class Lineage:
             begin=float(tracks.first.min()), now=float(tracks.end.max()),
             known=np.unique(tracks.colony).tolist(),
         )  # fmt: skip
-        known, made._from, made._until = tracks.parent >= 0, tracks.first, tracks.end
+        made._from, made._until, made.interval = tracks.first, tracks.end, tracks.interval
+        known = tracks.parent >= 0
         made.born = np.where(known, tracks.first, np.nan)
         made.birth_length = np.where(known, tracks.birth_length, np.nan)
         mothers = made._mothers

@@ -27,7 +27,7 @@ class Tracks:
 
     source: the file or the table, for messages. colony, cell, parent (−1: none known): (N,) int64.
     first, last: h, of its first and last frame. birth_length, end_length: µm, in these frames, NaN
-    where lengths are not known. end: h, of the last frame of its movie.
+    where lengths are not known. end: h, of the last frame of its movie. interval: between frames.
     """
 
     source: str
@@ -39,6 +39,7 @@ class Tracks:
     birth_length: np.ndarray
     end_length: np.ndarray
     end: np.ndarray
+    interval: float
 
 
 def table_tracks(
@@ -108,8 +109,8 @@ def _of_rows(
     end = np.array([over[c] for c in colony[starts].tolist()])
     return _checked(Tracks(
         source, colony[starts], cell[starts], mothers, hours[starts], hours[ends], sizes[starts],
-        sizes[ends], end,
-    ), _interval(colony, hours))  # fmt: skip
+        sizes[ends], end, _interval(colony, hours),
+    ))  # fmt: skip
 
 
 def challenge_tracks(path: str | Path, interval: float) -> Tracks:
@@ -134,8 +135,8 @@ def challenge_tracks(path: str | Path, interval: float) -> Tracks:
         raise InputError(f"{path}: each label must be there once, and end after it begins.")
     return _checked(Tracks(
         str(path), nothing, cell, np.where(parent == 0, NONE, parent), interval * first,
-        interval * last, none, none, np.full(len(cell), interval * last.max()),
-    ), interval)  # fmt: skip
+        interval * last, none, none, np.full(len(cell), interval * last.max()), interval,
+    ))  # fmt: skip
 
 
 def _interval(colony: np.ndarray, hours: np.ndarray) -> float:
@@ -207,12 +208,12 @@ def _parents(given: tables.Table, column: str, cell: np.ndarray) -> np.ndarray:
     return np.array(values, np.int64)
 
 
-def _checked(tracks: Tracks, interval: float) -> Tracks:
-    """Sorted by their beginnings. interval: h, between frames. Raises InputError for a parent that
+def _checked(tracks: Tracks) -> Tracks:
+    """Sorted by their beginnings. Raises InputError for a parent that
     is no cell, or that is there as its daughter begins, or later; warns of cells with one daughter
     or with more than two, and of gaps between mothers and daughters."""
     source, order = tracks.source, np.argsort(tracks.first, kind="stable")
-    columns = (f.name for f in fields(tracks) if f.name != "source")
+    columns = (f.name for f in fields(tracks) if f.name not in ("source", "interval"))
     found = replace(tracks, **{name: getattr(tracks, name)[order] for name in columns})
     place = {key: k for k, key in enumerate(zip(found.colony.tolist(), found.cell.tolist(),
                                                 strict=True))}  # fmt: skip
@@ -236,7 +237,7 @@ def _checked(tracks: Tracks, interval: float) -> Tracks:
                 " movies one? A column colony tells them apart."
             )
         daughters[mother] += 1
-        gaps += found.first[k] - found.last[mother] > GAP * interval
+        gaps += found.first[k] - found.last[mother] > GAP * tracks.interval
     for count, what in ((daughters == 1, "one daughter"), (daughters > 2, "more than two")):
         if count.any():
             some = ", ".join(map(str, found.cell[count][:8].tolist()))

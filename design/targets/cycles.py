@@ -1,0 +1,284 @@
+"""Cell cycles, from the division that makes a cell to its own: of simulated colonies and of tracked
+cells alike, and their statistics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchfilm as tf
+
+FEWEST = 3  # complete cycles of a colony, for statistics of them
+EVENT = 7  # numbers of a division in a note, after the time
+BITS = 40  # of a uid, beside the place of its colony
+CAPS = 4.0 / 3.0  # the caps of a rod have the volume of a length of so many radii
+STEADY = 1e-9  # relative variation that rounding can cause
+DRAWN = 200  # colonies whose cycles are drawn again
+
+GROUPS = {
+    "generation time": ("generation_time_h", "generation_time_cv"),
+    "birth length": ("birth_length_um", "birth_length_cv"),
+    "division length": ("division_length_um", "division_length_cv"),
+    "added length": ("added_length_um", "added_length_cv", "added_length_slope"),
+    "growth": ("growth_per_h", "growth_cv"),
+    "sisters": ("generation_time_sisters",),
+    "mothers": ("generation_time_mothers",),
+    "lengths of mothers": ("birth_length_mothers", "growth_mothers"),
+}
+OF_LENGTHS = ("birth length", "division length", "added length", "growth", "lengths of mothers")
+OF_MOTHERS = ("mothers", "lengths of mothers")
+
+
+@dataclass(frozen=True)
+class CycleStatistics:
+    """Which statistics of cell cycles are compared.
+
+    lengths: whether the lengths of cells are known. sisters, mothers: whether cells are compared
+    with theirs. omitted: groups that are left out.
+    """
+
+    lengths: bool
+    sisters: bool
+    mothers: bool
+    omitted: tuple[str, ...] = ()
+    species: ClassVar[tuple[str, ...]] = ()
+    ages: ClassVar[bool] = False
+    positions: ClassVar[bool] = False
+
+    @property
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """The names of the statistics, (K,) in all, by what they are about."""
+        left_out = {
+            *self.omitted,
+            *(() if self.lengths else OF_LENGTHS),
+            *(() if self.sisters else ("sisters",)),
+            *(() if self.mothers else OF_MOTHERS),
+        }
+        return {group: names for group, names in GROUPS.items() if group not in left_out}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all statistics, (K,)."""
+        return tuple(name for names in self.groups.values() for name in names)
+
+    def of(self, cycles: CellCycles, colonies: int) -> np.ndarray:
+        """The statistics of each of some colonies, (C, K); NaN of those with fewer than 3 complete
+        cycles."""
+        each = cycles.tables(colonies)
+        nothing = [np.nan] * len(self.names)
+        return np.array([self.of_rows(own) if len(own) >= FEWEST else nothing for own in each])
+
+    def of_rows(self, rows: np.ndarray) -> list[float]:
+        """The statistics of the cycles of one colony, (K,), from rows of `CellCycles.table`."""
+        columns = dict(zip(COLUMNS, np.ascontiguousarray(rows.T), strict=True))
+        return [MEASURES[name](columns) for name in self.names]
+
+    def resampled_spread(self, rows: np.ndarray) -> np.ndarray:
+        """The standard deviation of each statistic (K,) when the cycles of one colony are drawn
+        again with replacement."""
+        draws = np.random.default_rng(0)
+        each = [self.of_rows(rows[draws.integers(len(rows), size=len(rows))]) for _ in range(DRAWN)]
+        return np.nanstd(np.array(each), axis=0)
+
+
+# of a cycle, its mother's and its sister's; NaN where these are not known
+COLUMNS = (
+    "time", "birth", "division", "growth", "mother time", "mother birth", "mother growth",
+    "sister time",
+)  # fmt: skip
+Columns = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class CellCycles:
+    """Complete cell cycles, of cells that were born and divided: (M,) each, colony by colony.
+
+    colony: its place. mother, sister: the rows of hers, −1 where they are not complete, or not
+    known. time: h, from birth to division. birth, division: lengths of the centreline, µm, NaN
+    where they are not known. radius: µm.
+    """
+
+    colony: np.ndarray
+    mother: np.ndarray
+    sister: np.ndarray
+    time: np.ndarray
+    birth: np.ndarray
+    division: np.ndarray
+    radius: np.ndarray
+
+    def tables(self, colonies: int) -> list[np.ndarray]:
+        """The `COLUMNS` of the cycles of each colony, (M, 8)."""
+        caps = CAPS * self.radius
+        ratio = (self.division + caps) / (self.birth + caps)
+        rate = np.log(ratio) / np.where(self.time > 0, self.time, np.nan)
+        of_mother = lambda values: np.where(self.mother < 0, np.nan, values[self.mother])
+        of_sister = np.where(self.sister < 0, np.nan, self.time[self.sister])
+        own = (self.time, self.birth, self.division, rate)
+        columns = (*own, *map(of_mother, (self.time, self.birth, rate)), of_sister)
+        return np.split(np.stack(columns, 1), np.searchsorted(self.colony, range(1, colonies)))
+
+    @staticmethod
+    def of_lineage(lineage: tf.Lineage, radius: float) -> CellCycles:
+        """Those of tracked cells, or of a run. Between frames cells are not seen: they are born and
+        divide half an interval, on average, before they are seen to, and grow until then as they do
+        between their own frames."""
+        born = (lineage.parent >= 0) & np.isfinite(lineage.born)
+        rows = np.flatnonzero(born & (lineage.fate == "divided"))
+        colony = np.unique(lineage.colony, return_inverse=True)[1][rows]
+        order = np.argsort(colony, kind="stable")
+        rows, colony = rows[order], colony[order]
+        time = lineage.ended[rows] - lineage.born[rows]
+        birth, division = lineage.birth_length[rows], lineage.end_length[rows]
+        if lineage.interval:
+            seen = time - lineage.interval  # from its first frame to its last
+            seen = np.where(seen > 1e-9, seen, np.nan)
+            caps = CAPS * radius
+            unseen = ((division + caps) / (birth + caps)) ** (0.5 * lineage.interval / seen)
+            birth, division = (birth + caps) / unseen - caps, (division + caps) * unseen - caps
+        place = np.full(len(lineage), -1)
+        place[rows] = np.arange(len(rows))
+        mother, sister = np.full((2, len(lineage)), -1)
+        of_mothers, of_sisters = lineage.pairs("mother").T, lineage.pairs("sister").T
+        mother[of_mothers[1]] = place[of_mothers[0]]
+        sister[of_sisters[0]], sister[of_sisters[1]] = place[of_sisters[1]], place[of_sisters[0]]
+        widths = np.full(len(rows), radius)
+        return CellCycles(colony, mother[rows], sister[rows], time, birth, division, widths)
+
+    @staticmethod
+    def of_notes(history: Tensor) -> CellCycles:
+        """Those of simulated colonies, from the `division_note`s of all steps, (T, B, 1 + 7M)."""
+        notes = history.detach().cpu().double().numpy().transpose(1, 0, 2)
+        events = notes[:, :, 1:].reshape(*notes.shape[:2], -1, EVENT)
+        colony, step, _ = there = np.nonzero(events[..., 0] > 0)
+        of = events[there]
+        mother = _key(colony, of[:, 0] - 1.0)
+        time, length = notes[colony, step, 0], of[:, 1]
+        daughters = np.concatenate([_key(colony, of[:, 3]), _key(colony, of[:, 4])])
+        # of each daughter the event of her birth and her sister; of each mother her cycle
+        events_of, other = np.tile(np.arange(len(of)), 2), np.roll(daughters, len(of))
+        order = np.argsort(daughters)
+        at = _places(daughters[order], mother)
+        complete = np.flatnonzero(at >= 0)
+        at = order[at[complete]]
+        event, length_at_birth = events_of[at], np.concatenate([of[:, 5], of[:, 6]])[at]
+        cycle = np.argsort(mother[complete])
+        found = lambda keys: _taken(cycle, _places(mother[complete][cycle], keys))
+        return CellCycles(
+            colony[complete], found(mother[event]), found(other[at]), time[complete] - time[event],
+            length_at_birth, length[complete], of[complete, 2],
+        )  # fmt: skip
+
+
+def _places(ordered: np.ndarray, keys: np.ndarray) -> np.ndarray:
+    """Where each key is among ordered ones; −1 where it is not."""
+    if not len(ordered):
+        return np.full(len(keys), -1)
+    at = np.minimum(np.searchsorted(ordered, keys), len(ordered) - 1)
+    return np.where(ordered[at] == keys, at, -1)
+
+
+def _taken(values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """The values at some places; −1 at the place −1."""
+    return np.where(at < 0, -1, values[at]) if len(values) else at
+
+
+def _key(colony: np.ndarray, uid: np.ndarray) -> np.ndarray:
+    return (colony << BITS) + uid.astype(np.int64)
+
+
+@torch.no_grad()
+def division_note(state: tf.State) -> Tensor:
+    """The time, and the divisions of the last step, (B, 1 + 7M) float64: of each the uid of the
+    mother + 1, her length and radius, and the uids and lengths of both daughters; 0 beyond those of
+    a colony."""
+    time = torch.full((state.colonies, 1), state.time, dtype=torch.float64, device=state.device)
+    owners, rows = [], []
+    for births in state.births:
+        before = births.before
+        mother = [getattr(before, name)[births.rows] for name in ("uid", "length", "radius")]
+        mother[0] = mother[0] + 1
+        owners.append(before.colony_id[before.colony[births.rows]])
+        columns = (*mother, *births.uid.chunk(2), *births.length.chunk(2))
+        rows.append(torch.stack([c.double() for c in columns], 1))
+    if not rows:
+        return time
+    # colonies that have left since are not looked for
+    owner, row = torch.cat(owners), torch.cat(rows)
+    ids, order = state.colony_id.sort()
+    at = torch.searchsorted(ids, owner).clamp(max=len(ids) - 1)
+    here = ids[at] == owner
+    place, row = order[at[here]], row[here]
+    place, sequence = place.sort(stable=True)
+    counts = torch.bincount(place, minlength=state.colonies)
+    within = torch.arange(len(place), device=place.device) - (counts.cumsum(0) - counts)[place]
+    found = time.new_zeros(state.colonies, int(counts.max()), EVENT)
+    found[place, within] = row[sequence]
+    return torch.cat([time, found.flatten(1)], 1)
+
+
+def _mean(name: str) -> Callable[[Columns], float]:
+    return lambda columns: _average(columns[name])
+
+
+def _average(values: np.ndarray) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else np.nan
+
+
+def _variation(values: np.ndarray) -> float:
+    """The coefficient of variation."""
+    known = values[np.isfinite(values)]
+    mean = float(known.mean()) if len(known) > 1 else 0.0
+    return float(known.std(ddof=1)) / mean if mean else np.nan
+
+
+def _deviations(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
+    """The covariance of values that are both known, and the variances of both; 0 for one that
+    varies by no more than rounding."""
+    both = np.isfinite(x) & np.isfinite(y)
+    if both.sum() < FEWEST:
+        return np.nan, np.nan, np.nan
+    x, y = x[both], y[both]
+    of = [values - values.mean() for values in (x, y)]
+    squares = [float((d * d).mean()) for d in of]
+    for k, values in enumerate((x, y)):
+        if squares[k] <= (STEADY * float(np.abs(values).max())) ** 2:
+            squares[k] = 0.0
+    return float((of[0] * of[1]).mean()), squares[0], squares[1]
+
+
+def _correlation(x: np.ndarray, y: np.ndarray) -> float:
+    together, of_x, of_y = _deviations(x, y)
+    if np.isnan(together):
+        return np.nan
+    return together / float(np.sqrt(of_x * of_y)) if of_x and of_y else 0.0
+
+
+def _slope(x: np.ndarray, y: np.ndarray) -> float:
+    """Of y on x."""
+    together, of_x, _ = _deviations(x, y)
+    return together / of_x if of_x else np.nan if np.isnan(together) else 0.0
+
+
+MEASURES: dict[str, Callable[[Columns], float]] = {
+    "generation_time_h": _mean("time"),
+    "generation_time_cv": lambda c: _variation(c["time"]),
+    "birth_length_um": _mean("birth"),
+    "birth_length_cv": lambda c: _variation(c["birth"]),
+    "division_length_um": _mean("division"),
+    "division_length_cv": lambda c: _variation(c["division"]),
+    "added_length_um": lambda c: _average(c["division"] - c["birth"]),
+    "added_length_cv": lambda c: _variation(c["division"] - c["birth"]),
+    "added_length_slope": lambda c: _slope(c["birth"], c["division"] - c["birth"]),
+    "growth_per_h": _mean("growth"),
+    "growth_cv": lambda c: _variation(c["growth"]),
+    "generation_time_sisters": lambda c: _correlation(c["time"], c["sister time"]),
+    "generation_time_mothers": lambda c: _correlation(c["time"], c["mother time"]),
+    "birth_length_mothers": lambda c: _correlation(c["birth"], c["mother birth"]),
+    "growth_mothers": lambda c: _correlation(c["growth"], c["mother growth"]),
+}

@@ -1,0 +1,272 @@
+"""Cell cycles of tracked cells as data, and those of simulated colonies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import torchfilm as tf
+from design import Objective, Observed, ObservedCourse, ObservedCycles, Parameter, Search, Task
+from design import colonies as runs
+from design.growing import FailedColony, FinishedColonies, grow
+from design.simulations import simulate_designs
+from design.targets.cycles import COLUMNS, FEWEST, CellCycles, CycleStatistics, division_note
+from tests.design.searching import fragile, lit
+from torchfilm.tools.checks import InputError
+
+EVERY = CycleStatistics(lengths=True, sisters=True, mothers=True)
+CAPS = 4.0 / 3.0 * 0.5  # µm of centreline whose volume is that of the caps
+
+
+def adder(added=1.6, rate=1.2, noise=0.1):
+    return tf.Scene(
+        tf.Growth(rate=tf.LogNormal(rate, noise)),
+        tf.Division(added=tf.LogNormal(added, 0.1)),
+        founders=tf.Cells.single(2, length=2.0),
+        dim=2,
+        dt=0.05,
+    )
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A recorded run, its notes, (T, B, k), and its last state."""
+    path = tmp_path_factory.mktemp("cycles") / "run.h5"
+    notes = []
+    recorder = tf.Recorder(path, adder(), every=1)
+    for state in tf.simulate(adder(), until=4.0, colonies=3, seed=7, record=recorder):
+        notes.append(division_note(state))
+    return path, stacked(notes), state
+
+
+def stacked(notes):
+    widest = max(n.shape[1] for n in notes)
+    return torch.stack([torch.nn.functional.pad(n, (0, widest - n.shape[1])) for n in notes])
+
+
+def tracks(cells, interval=5.0):
+    """A lineage of cells that are (number, parent, first minute, minutes, length at birth, growth
+    per hour), seen every few minutes from their first on."""
+    rows = {"cell": [], "parent": [], "time_min": [], "length_um": []}
+    for cell, parent, first, minutes, length, rate in cells:
+        for k in range(round(minutes / interval)):
+            hours = k * interval / 60
+            volume = (length + CAPS) * np.exp(rate * hours)
+            values = cell, parent, first + k * interval, volume - CAPS
+            for column, value in zip(rows.values(), values, strict=True):
+                column.append(value)
+    return tf.Lineage.from_table(rows)
+
+
+def test_notes_of_steps_tell_what_the_lineage_of_a_run_tells(run):
+    path, notes, state = run
+    with tf.Results(path) as results:
+        lineage = results.lineage()
+    data = ObservedCycles(lineage)
+    assert data.colonies == 3 and data.cycles > 100 and data.time == pytest.approx(4.0)
+    each = data.statistics(state, notes).numpy()
+    of_runs = EVERY.of(CellCycles.of_lineage(lineage, 0.5), 3)
+    np.testing.assert_allclose(each, of_runs, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(each.mean(0), data.values, rtol=1e-9, atol=1e-12)
+    found = dict(zip(data.plan.names, data.values, strict=True))
+    # what the scene says, within the errors of some hundred cells
+    assert found["growth_per_h"] == pytest.approx(1.2, rel=0.04)
+    # cells divide as a step ends, half of one late
+    late = 0.5 * 0.05 * 1.2 * (found["division_length_um"] + CAPS)
+    assert found["added_length_um"] == pytest.approx(1.6 + late, rel=0.03)
+    assert found["growth_cv"] == pytest.approx(0.1, rel=0.3)
+    assert abs(found["added_length_slope"]) < 0.3 and found["birth_length_mothers"] > 0.3
+    # ln 2 / rate is the mean of populations in balance
+    assert found["generation_time_h"] == pytest.approx(np.log(2.0) / 1.2, rel=0.2)
+    assert data.loss(state, notes).max() < 5.0
+
+
+def test_cycles_and_relatives_are_those_of_the_tracks():
+    cells = [
+        (1, 0, 0, 30, 2.0, 1.0),
+        (2, 1, 30, 20, 1.0, 1.0), (3, 1, 30, 40, 1.2, 1.2),
+        (4, 2, 50, 30, 0.8, 1.4), (5, 2, 50, 10, 0.9, 1.1),
+        (6, 4, 80, 20, 0.7, 1.0), (7, 4, 80, 20, 0.7, 1.0), (8, 3, 70, 10, 1.1, 1.0),
+        (9, 3, 70, 10, 1.1, 1.0),
+    ]  # fmt: skip
+    lineage = tracks(cells)
+    (rows,) = CellCycles.of_lineage(lineage, 0.5).tables(1)
+    # 2, 3 and 4 are born and divide; 5, 8 and 9 are lost
+    by = dict(zip(COLUMNS, rows.T, strict=True))
+    np.testing.assert_allclose(by["time"], np.array([20, 40, 30]) / 60)
+    np.testing.assert_allclose(by["mother time"] * 60, [np.nan, np.nan, 20])
+    np.testing.assert_allclose(by["sister time"] * 60, [40, 20, np.nan])
+    np.testing.assert_allclose(by["growth"], [1.0, 1.2, 1.4], rtol=1e-9)
+    np.testing.assert_allclose(by["mother growth"], [np.nan, np.nan, 1.0], rtol=1e-9)
+    # half of 5 min before the first frame, and after the last one
+    unseen = np.exp(-np.array([1.0, 1.2, 1.4]) * 2.5 / 60)
+    births = (np.array([1.0, 1.2, 0.8]) + CAPS) * unseen - CAPS
+    np.testing.assert_allclose(by["birth"], births, rtol=1e-9)
+    grown = np.exp(np.array([1.0, 1.2, 1.4]) * np.array([20, 40, 30]) / 60)
+    np.testing.assert_allclose(by["division"], (births + CAPS) * grown - CAPS, rtol=1e-9)
+    assert np.isnan(by["mother birth"][:2]).all() and by["mother birth"][2] == by["birth"][0]
+
+
+def test_an_adder_a_sizer_and_a_timer_are_told_apart():
+    births = np.array([1.0, 1.2, 1.5, 0.9])
+    nothing = np.full(4, np.nan)
+    at = lambda division: np.stack([np.full(4, 0.5), births, division, *[nothing] * 5], 1)
+    names = CycleStatistics(lengths=True, sisters=False, mothers=False).names
+    slope = lambda rows: EVERY.of_rows(rows)[names.index("added_length_slope")]
+    assert slope(at(births + 1.5)) == pytest.approx(0.0, abs=1e-12)
+    assert slope(at(np.full(4, 3.0))) == pytest.approx(-1.0)
+    assert slope(at(2.0 * births)) == pytest.approx(1.0)
+    alike = np.stack([np.full(4, 0.5), np.full(4, 0.1 + 0.2), *[np.full(4, 0.7)] * 6], 1)
+    alike[1:, 1] = 0.3  # but for rounding, no length varies
+    found = dict(zip(EVERY.names, EVERY.of_rows(alike), strict=True))
+    assert found["added_length_slope"] == 0.0 and found["birth_length_mothers"] == 0.0
+    assert found["generation_time_cv"] == 0.0
+
+
+def test_a_colony_has_the_same_statistics_alone_and_beside_others(run):
+    _, notes, _ = run
+    together = EVERY.of(CellCycles.of_notes(notes), 3)
+    for colony in range(3):
+        alone = EVERY.of(CellCycles.of_notes(notes[:, [colony]]), 1)
+        np.testing.assert_array_equal(alone[0], together[colony])
+    mixed = EVERY.of(CellCycles.of_notes(notes[:, [2, 0, 1]]), 3)
+    np.testing.assert_array_equal(mixed, together[[2, 0, 1]])
+    none = EVERY.of(CellCycles.of_notes(notes[:2]), 3)  # before the first division
+    assert np.isnan(none).all()
+
+
+def test_births_are_noted_in_the_step_in_which_another_colony_fails():
+    settings = runs.RunSettings(3, 0.1, torch.float32, "cpu", 1, None, replay=False)
+
+    def cycles(makes):
+        prepared = runs.prepare(fragile(torch.tensor(makes)), range(len(makes)), settings)
+        events = list(grow(prepared, cells=None, until=2.5, note=division_note))
+        (whole,) = (e for e in events if isinstance(e, FinishedColonies))
+        failed = [e for e in events if isinstance(e, FailedColony)]
+        return failed, EVERY.of(CellCycles.of_notes(whole.history), whole.state.colonies)
+
+    failed, found = cycles([1.0, *[9.0] * 8])
+    assert len(failed) == 8
+    _, alone = cycles([1.0])
+    np.testing.assert_array_equal(found, alone)
+
+
+@pytest.mark.parametrize("replay", [True, False])
+def test_recorded_growth_has_the_same_cycles(replay):
+    settings = runs.RunSettings(3, 0.1, torch.float32, "cpu", 2, None, replay)
+    prepared = runs.prepare(lit(torch.tensor([1.0, 1.0])), range(2), settings)
+    assert bool(prepared.why_regrown) is not replay
+    (whole,) = grow(prepared, cells=None, until=1.5, note=division_note)
+    found = EVERY.of(CellCycles.of_notes(whole.history), 2)
+    assert np.isfinite(found[:, 0]).all()
+    told = []
+    for state in tf.simulate(lit(torch.tensor([1.0, 1.0])), until=1.5, colonies=2, seed=3):
+        told.append(division_note(state))
+    np.testing.assert_allclose(found, EVERY.of(CellCycles.of_notes(stacked(told)), 2), rtol=1e-6)
+
+
+def test_a_search_finds_what_the_cells_add(run):
+    path, _, _ = run
+    with tf.Results(path) as results:
+        data = ObservedCycles(results.lineage())
+    added = Parameter("added", 0.9, 2.8, log=True)
+    best = Search(adder, [added], data, replicates=2, seed=1).run(64, progress=False)
+    assert best.values["added"] == pytest.approx(1.6, rel=0.05)
+    assert best.loss < 4.0
+
+
+def test_a_colony_with_few_cycles_fails_with_the_reason(run):
+    path, _, _ = run
+    with tf.Results(path) as results:
+        data = ObservedCycles(results.lineage())
+    slow = Parameter("rate", 0.1, 0.2)
+    task = Task(adder, [slow], data, replicates=1)
+    found = Objective(task).evaluate(np.array([[0.5]]))
+    assert found.reasons[0, 0] == (
+        "the target's loss was nan: generation_time_h was not a number, as the colony had fewer"
+        " than 3 complete cell cycles, or pairs of relatives"
+    )
+    simulated = simulate_designs(task, 2)
+    assert simulated.reasons[0].startswith("generation_time_h is not a number, as the colony had")
+
+
+def unmeasured(folder):
+    """A lineage without lengths."""
+    lines = ["1 0 3 0", "2 4 9 1", "3 4 8 1", "4 10 14 2", "5 10 18 2", "6 9 18 3", "7 9 18 3",
+             "8 15 18 4", "9 15 18 4"]  # fmt: skip
+    (folder / "man_track.txt").write_text("\n".join(lines), encoding="utf-8")
+    return tf.Lineage.from_ctc(folder / "man_track.txt", interval=0.1)
+
+
+def test_generation_times_alone_where_no_lengths_are_known(tmp_path):
+    data = ObservedCycles(unmeasured(tmp_path))
+    assert data.plan.names == ("generation_time_h", "generation_time_cv")
+    assert data.values == pytest.approx((16 / 30, 0.1 / np.sqrt(3) / (16 / 30)))  # 6, 5 and 5
+
+
+def test_groups_are_left_out(run):
+    path, notes, state = run
+    with tf.Results(path) as results:
+        data = ObservedCycles(results.lineage())
+    less = data.without("growth", "sisters")
+    assert "growth_per_h" not in less.plan.names and "growth" in data.plan.groups
+    kept = [data.plan.names.index(n) for n in less.plan.names]
+    assert less.values == tuple(data.values[k] for k in kept)
+    np.testing.assert_array_equal(
+        less.statistics(state, notes), data.statistics(state, notes)[:, kept]
+    )
+    with pytest.raises(InputError, match="growth time"):
+        data.without("growth time")
+    with pytest.raises(InputError, match="not all of the groups"):
+        data.without(*data.plan.groups)
+
+
+def test_what_is_refused(run, tmp_path):
+    path, _, _ = run
+    with tf.Results(path) as results:
+        lineage = results.lineage()
+    for wrong in (3.0, [], [lineage, None], "cells.csv"):
+        with pytest.raises(InputError, match=r"a tf\.Lineage, or a list of them"):
+            ObservedCycles(wrong)
+    few = tracks([(1, 0, 0, 30, 2.0, 1.0), (2, 1, 30, 20, 1.0, 1.0), (3, 1, 30, 40, 1.2, 1.2)])
+    with pytest.raises(
+        InputError, match=f"colony 0 = 0 is not allowed: it must be at least {FEWEST}"
+    ):
+        ObservedCycles(few)
+    with tf.Results(path) as results:
+        shorter = results.lineage()
+    shorter.now = 3.0
+    with pytest.raises(InputError, match="that last as long as each other"):
+        ObservedCycles([lineage, shorter])
+    timed = ObservedCycles(unmeasured(tmp_path))
+    with pytest.raises(InputError, match="of statistics that these data have"):
+        ObservedCycles(unmeasured(tmp_path), like=ObservedCycles(lineage))
+    assert ObservedCycles(lineage, like=timed).plan == timed.plan
+    data = ObservedCycles(lineage)
+    with pytest.raises(InputError, match="an Observed or a Measured"):
+        ObservedCourse([data, data])
+    with pytest.raises(InputError, match="an ObservedCycles, or None"):
+        ObservedCycles(lineage, like=Observed.from_state(run[2]))
+    with pytest.raises(InputError, match="above 0"):
+        ObservedCycles(lineage, radius=0.0)
+    with pytest.raises(InputError, match="notes of all steps"):
+        data.statistics(run[2])
+
+
+def test_several_lineages_are_replicates(run):
+    path, _, _ = run
+    with tf.Results(path) as results:
+        lineage = results.lineage()
+    both = ObservedCycles([lineage, lineage])
+    one = ObservedCycles(lineage)
+    assert both.colonies == 6 and both.cycles == 2 * one.cycles
+    np.testing.assert_allclose(both.values, one.values)
+
+
+def test_cells_of_another_width_are_warned_of(run):
+    path, _, state = run
+    with tf.Results(path) as results:
+        data = ObservedCycles(results.lineage(), radius=0.4)
+    with pytest.warns(UserWarning, match=r"0\.80 µm wide"):
+        data.check(state)
