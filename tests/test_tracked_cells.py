@@ -145,6 +145,27 @@ def test_cells_with_one_daughter_are_told():
     assert tree.fate[1] == "divided" and tree.sister.tolist() == [-1, 3, 2, -1]
 
 
+def test_a_cell_and_its_only_daughter_are_one_where_joined():
+    # 2 is lost at 40 min, found as 8 at 50, and divides into 9 and 10; 3 goes on as 6, then as 7
+    rows = [
+        (1, 0, 0, 2.0), (1, 0, 10, 3.0), (2, 1, 20, 1.6), (2, 1, 30, 2.0), (8, 2, 50, 3.0),
+        (9, 8, 60, 1.6), (10, 8, 60, 1.7), (3, 1, 20, 1.4), (6, 3, 30, 1.8), (7, 6, 40, 2.2),
+        (7, 6, 50, 2.6),
+    ]  # fmt: skip
+    tree = tf.Lineage.from_table(table(rows), join=True)  # without a warning
+    assert tree.cell.tolist() == [1, 2, 3, 9, 10] and tree.parent.tolist() == [-1, 1, 1, 2, 2]
+    assert tree.fate.tolist() == ["divided", "divided", "lost", "alive", "alive"]
+    assert tree.ended[:3] * 60 == pytest.approx([20, 60, 50])
+    assert tree.end_length[:3] == pytest.approx([3.0, 3.0, 2.6])
+    assert tree.sister.tolist() == [-1, 3, 2, 10, 9]
+    one = pytest.warns(UserWarning, match=r"3 cells have one daughter.*join=True takes a cell and")
+    with one, pytest.warns(UserWarning, match="1 cells begin later"):
+        cut = tf.Lineage.from_table(table(rows))
+    assert len(cut) == 8
+    with pytest.raises(InputError, match="join"):
+        tf.Lineage.from_table(table(rows), join="all")
+
+
 def test_a_file_of_tracks(tmp_path):
     path = tmp_path / "man_track.txt"
     path.write_text("1 0 1 0\n2 2 3 1\n3 2 3 1\n4 4 5 2\n5 4 5 2\n", encoding="utf-8")

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from torchfilm.io.layout import LINEAGE, LINEAGE_LATER, LINEAGE_NUMBERS
-from torchfilm.io.newick import newick
+from torchfilm.io.newick import newick, with_ancestors
 from torchfilm.io.reading import blaming_file, committed, read_dataset
 from torchfilm.io.table import Tables, data_frame, needed
 from torchfilm.io.tracks import LOST, Tracks, challenge_tracks, table_tracks
@@ -136,6 +136,7 @@ class Lineage:
         time_unit: str | None = None,
         columns: Mapping[str, str] | None = None,
         width: float | None = None,
+        join: bool = False,
     ) -> Lineage:
         """Cells that a microscope has followed: a row for each cell in each frame, of a CSV file or
         of columns by name.
@@ -144,7 +145,8 @@ class Lineage:
         cell is 0) or nothing where none is known; time; length, which may be missing; colony, a
         number for each movie. columns: their names where they differ. Units stand in the names, as
         in time_min and length_um, or in the arguments. width: µm, where lengths are those of whole
-        cells so wide: it is taken off them.
+        cells so wide: it is taken off them. join: a track and its only daughter are one cell, of
+        the first's number, as where tracking lost a cell for some frames.
 
         A cell is born in its first frame, if its parent is known, and divides as the first of its
         daughters begins. Without any it is "alive" in the last frame of its colony, and else
@@ -152,13 +154,13 @@ class Lineage:
         begin no earlier than their daughters, and two rows of a cell at one time.
         """
         units = tables.Units(pixel_size, length_unit, None, time_unit)
-        return Lineage._of_tracks(table_tracks(table, columns or {}, units, width))
+        return Lineage._of_tracks(table_tracks(table, columns or {}, units, width, join))
 
     @staticmethod
-    def from_ctc(path: str | Path, *, interval: float) -> Lineage:
+    def from_ctc(path: str | Path, *, interval: float, join: bool = False) -> Lineage:
         """Cells in a file of tracks of the Cell Tracking Challenge, such as man_track.txt, without
         their lengths. interval: h between frames. Else as `from_table`."""
-        return Lineage._of_tracks(challenge_tracks(path, interval))
+        return Lineage._of_tracks(challenge_tracks(path, interval, join))
 
     @staticmethod
     def _of_tracks(tracks: Tracks) -> Lineage:
@@ -320,23 +322,13 @@ class Lineage:
         there before the file counts from its first frame. alive: only living cells and their
         ancestors."""
         checks.choice("alive", alive, (True, False))
-        kept = self._leading_to_life if alive else np.ones(len(self), bool)
+        living = self.fate == "alive"
+        kept = with_ancestors(living, self._mothers) if alive else np.ones(len(self), bool)
         roots = [row for row in self._roots(colony) if kept[row]]
         lived = np.where(np.isnan(self.ended), self._until, self.ended) - self._from
         name = lambda row: "colony{}.cell{}".format(*self._node(row))
         below = {row: [d for d in of if kept[d]] for row, of in self._daughters.items()}
         return "".join(f"{newick(row, below, lived, name)};\n" for row in roots)
-
-    @cached_property
-    def _leading_to_life(self) -> np.ndarray:
-        """The cells that live, and their ancestors, (N,) bool."""
-        kept = self.fate == "alive"
-        new = np.flatnonzero(kept)
-        while new.size:
-            above = np.unique(self._mothers[new])
-            new = above[(above >= 0) & ~kept[above]]
-            kept[new] = True
-        return kept
 
     def to_networkx(self, colony: int | None = None) -> Any:
         """The trees of one colony, or of all, as a networkx.DiGraph from mother to daughter. Nodes

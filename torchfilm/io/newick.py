@@ -29,3 +29,15 @@ def newick(
                 stack += [daughter, ","]
             stack[-1] = "("
     return "".join(text)
+
+
+def with_ancestors(kept: np.ndarray, mothers: np.ndarray) -> np.ndarray:
+    """Rows (N,) bool and all their ancestors. mothers: the row of each one's mother, −1 where it
+    has none."""
+    kept = kept.copy()
+    new = np.flatnonzero(kept)
+    while new.size:
+        above = np.unique(mothers[new])
+        new = above[(above >= 0) & ~kept[above]]
+        kept[new] = True
+    return kept

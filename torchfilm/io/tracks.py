@@ -43,10 +43,10 @@ class Tracks:
 
 
 def table_tracks(
-    table: Any, columns: Mapping[str, str], units: tables.Units, width: float | None
+    table: Any, columns: Mapping[str, str], units: tables.Units, width: float | None, join: bool
 ) -> Tracks:
     """The tracks of a table with a row for each cell in each frame. width: of the cells, µm, which
-    lengths include; None where they are those of centrelines."""
+    lengths include; None where they are those of centrelines. join: see `_checked`."""
     given = tables.Table.read(table)
     for name in columns:
         checks.choice("Lineage.from_table(columns)", name, MEANT)
@@ -70,7 +70,7 @@ def table_tracks(
     if "colony" in {**given.columns, **columns}:
         colony = _whole(given, columns.get("colony", "colony"), MOST_COLONIES)
     parent = _parents(given, columns.get("parent", "parent"), cell)
-    return _of_rows(given.source, colony, cell, parent, hours, sizes)
+    return _checked(_of_rows(given.source, colony, cell, parent, hours, sizes), join)
 
 
 def _of_rows(
@@ -107,15 +107,15 @@ def _of_rows(
         )
     over = {c: float(hours[colony == c].max()) for c in np.unique(colony).tolist()}
     end = np.array([over[c] for c in colony[starts].tolist()])
-    return _checked(Tracks(
+    return Tracks(
         source, colony[starts], cell[starts], mothers, hours[starts], hours[ends], sizes[starts],
         sizes[ends], end, _interval(colony, hours),
-    ))  # fmt: skip
+    )  # fmt: skip
 
 
-def challenge_tracks(path: str | Path, interval: float) -> Tracks:
+def challenge_tracks(path: str | Path, interval: float, join: bool) -> Tracks:
     """The tracks of a file of the Cell Tracking Challenge: label, first and last frame, parent (0:
-    none). interval: h between frames."""
+    none). interval: h between frames. join: see `_checked`."""
     path = checks.file_path("Lineage.from_ctc(path)", path)
     checks.number("Lineage.from_ctc(interval)", interval, above=0.0)
     if path.is_dir() or not path.is_file():
@@ -136,7 +136,7 @@ def challenge_tracks(path: str | Path, interval: float) -> Tracks:
     return _checked(Tracks(
         str(path), nothing, cell, np.where(parent == 0, NONE, parent), interval * first,
         interval * last, none, none, np.full(len(cell), interval * last.max()), interval,
-    ))  # fmt: skip
+    ), join)  # fmt: skip
 
 
 def _interval(colony: np.ndarray, hours: np.ndarray) -> float:
@@ -208,46 +208,81 @@ def _parents(given: tables.Table, column: str, cell: np.ndarray) -> np.ndarray:
     return np.array(values, np.int64)
 
 
-def _checked(tracks: Tracks) -> Tracks:
-    """Sorted by their beginnings. Raises InputError for a parent that
-    is no cell, or that is there as its daughter begins, or later; warns of cells with one daughter
-    or with more than two, and of gaps between mothers and daughters."""
-    source, order = tracks.source, np.argsort(tracks.first, kind="stable")
-    columns = (f.name for f in fields(tracks) if f.name not in ("source", "interval"))
-    found = replace(tracks, **{name: getattr(tracks, name)[order] for name in columns})
-    place = {key: k for k, key in enumerate(zip(found.colony.tolist(), found.cell.tolist(),
-                                                strict=True))}  # fmt: skip
-    daughters, gaps = np.zeros(len(order), np.int64), 0
-    for k in np.flatnonzero(found.parent != NONE).tolist():
-        mother = place.get((int(found.colony[k]), int(found.parent[k])))
-        if mother is None:
-            raise InputError(
-                f"{source}: cell {found.cell[k]} has the parent {found.parent[k]}, which is no cell"
-                " of its colony. Give −1, 0 or nothing where it is not known."
-            )
-        if found.first[mother] >= found.first[k]:
-            raise InputError(
-                f"{source}: cell {found.cell[k]} begins at {found.first[k]:g} h, no later than its"
-                f" parent {found.parent[k]}."
-            )
-        if found.last[mother] >= found.first[k]:
-            raise InputError(
-                f"{source}: cell {found.parent[k]} is there at {found.last[mother]:g} h, and its"
-                f" daughter {found.cell[k]} from {found.first[k]:g} h on. Are cells of several"
-                " movies one? A column colony tells them apart."
-            )
-        daughters[mother] += 1
-        gaps += found.first[k] - found.last[mother] > GAP * tracks.interval
-    for count, what in ((daughters == 1, "one daughter"), (daughters > 2, "more than two")):
-        if count.any():
-            some = ", ".join(map(str, found.cell[count][:8].tolist()))
+def _checked(tracks: Tracks, join: bool) -> Tracks:
+    """Sorted by their beginnings. join: those with one daughter are one cell with her. Raises
+    InputError for parents that are not possible; warns of cells with one daughter or with more than
+    two, and of gaps between mothers and daughters."""
+    checks.choice("join", join, (True, False))
+    found = _taken(tracks, np.argsort(tracks.first, kind="stable"))
+    mothers = _mothers(found)
+    count = np.bincount(mothers[mothers >= 0], minlength=len(mothers))
+    if join and (count == 1).any():
+        found = _joined(found, mothers, count == 1)
+        mothers = _mothers(found)
+        count = np.bincount(mothers[mothers >= 0], minlength=len(mothers))
+    source, known = found.source, np.flatnonzero(mothers >= 0)
+    hint = " join=True takes a cell and its only daughter for one."
+    for some, what, more in ((count == 1, "one daughter", hint), (count > 2, "more than two", "")):
+        if some.any():
+            cells = ", ".join(map(str, found.cell[some][:8].tolist()))
             warn(
-                f"{source}: {int(count.sum())} cells have {what} (such as {some}): tracks may be"
-                " cut or wrongly joined there. They count as divided."
+                f"{source}: {int(some.sum())} cells have {what} (such as {cells}): tracks may be"
+                f" cut or wrongly joined there. They count as divided.{more}"
             )
-    if gaps:
+    gaps = found.first[known] - found.last[mothers[known]] > GAP * found.interval
+    if gaps.any():
         warn(
-            f"{source}: {gaps} cells begin later than a frame after their parent's last one: when"
-            " they were born, and what lengths they had then, is not known so well."
+            f"{source}: {int(gaps.sum())} cells begin later than a frame after their parent's last"
+            " one: when they were born, and what lengths they had then, is not known so well."
         )
     return found
+
+
+def _taken(tracks: Tracks, rows: np.ndarray) -> Tracks:
+    """Some of the tracks, in this order."""
+    columns = (f.name for f in fields(tracks) if f.name not in ("source", "interval"))
+    return replace(tracks, **{name: getattr(tracks, name)[rows] for name in columns})
+
+
+def _mothers(tracks: Tracks) -> np.ndarray:
+    """The row of each track's parent, (N,), −1 where none is known. Raises InputError for a parent
+    that is no cell, or that is there as its daughter begins, or later."""
+    source, cells = tracks.source, zip(tracks.colony.tolist(), tracks.cell.tolist(), strict=True)
+    place = {key: k for k, key in enumerate(cells)}
+    mothers = np.full(len(tracks.cell), NONE)
+    for k in np.flatnonzero(tracks.parent != NONE).tolist():
+        mother = place.get((int(tracks.colony[k]), int(tracks.parent[k])))
+        if mother is None:
+            raise InputError(
+                f"{source}: cell {tracks.cell[k]} has the parent {tracks.parent[k]}, which is no"
+                " cell of its colony. Give −1, 0 or nothing where it is not known."
+            )
+        if tracks.first[mother] >= tracks.first[k]:
+            raise InputError(
+                f"{source}: cell {tracks.cell[k]} begins at {tracks.first[k]:g} h, no later than"
+                f" its parent {tracks.parent[k]}."
+            )
+        if tracks.last[mother] >= tracks.first[k]:
+            raise InputError(
+                f"{source}: cell {tracks.parent[k]} is there at {tracks.last[mother]:g} h, and its"
+                f" daughter {tracks.cell[k]} from {tracks.first[k]:g} h on. Are cells of several"
+                " movies one? A column colony tells them apart."
+            )
+        mothers[k] = mother
+    return mothers
+
+
+def _joined(tracks: Tracks, mothers: np.ndarray, single: np.ndarray) -> Tracks:
+    """Each track and its only daughter as one, of the mother's number. single: those that have one
+    daughter, (N,) bool. Mothers stand before daughters."""
+    root = np.arange(len(mothers))
+    end = root.copy()  # the last part of each
+    for k in np.flatnonzero(mothers >= 0).tolist():
+        if single[mothers[k]]:
+            root[k] = root[mothers[k]]
+            end[root[k]] = k
+    kept = np.flatnonzero(root == np.arange(len(root)))
+    above = mothers[kept]
+    parent = np.where(above < 0, NONE, tracks.cell[root[above]])
+    last, length = tracks.last[end[kept]], tracks.end_length[end[kept]]
+    return replace(_taken(tracks, kept), parent=parent, last=last, end_length=length)
