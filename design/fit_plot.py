@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 LISTED = 8  # conditions that a legend names
 FAR = 30.0  # doses of which the largest is so many times the smallest are drawn by their logarithms
+WITHIN = 1.64  # standard errors, within which 90 % of data lie
+FARTHEST, LINEAR = 15.0, 3.0  # standard errors: of a linear axis; of the linear part of another
 Ends = Mapping[str, tuple[float, float, float]]  # the middle, the least and the most, by full name
 
 
@@ -66,6 +68,27 @@ def draw_readings(
         ax.set_ylabel(name)
     ranges = any(r.low != r.high for r in readings)
     _legend(axes, curves, "measured or wanted" if ranges else "measured")
+
+
+def draw_pulls(ax: Axes, ends: Mapping[str, Sequence[float]]) -> None:
+    """Draw a row for each statistic: from where to where it is predicted, by a line with a mark in
+    the middle, in standard errors of the data from what was observed. Those on one side of it
+    differ in their colour and in their marks."""
+    rows = range(len(ends))
+    for row, (low, middle, high) in zip(rows, ends.values(), strict=True):
+        out = low > 0.0 or high < 0.0
+        colour, mark = ("C3", "D") if out else ("C0", "o")
+        ax.plot([low, high], [row, row], color=colour, lw=1.6, solid_capstyle="butt")
+        ax.plot(middle, row, mark, color=colour, ms=4)
+    ax.axvline(0.0, color="0.2", lw=0.8)
+    ax.axvspan(-WITHIN, WITHIN, color="0.9", zorder=0)
+    if max(abs(x) for row in ends.values() for x in row) > FARTHEST:
+        ax.set_xscale("symlog", linthresh=LINEAR)
+        ax.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
+    ax.set_yticks(rows, list(ends), fontsize=7)
+    ax.set_ylim(len(ends) - 0.5, -0.5)
+    ax.set_xlabel("predicted less observed, standard errors (grey: 90 % of a right model's data)")
+    ax.xaxis.label.set_fontsize(8)
 
 
 def _draw_one(

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 import torchfilm as tf
-from design.fit_plot import Curve, draw_readings, measures_of
+from design.fit_plot import Curve, draw_pulls, draw_readings, measures_of
 from design.targets.observed import Observed
 from design.targets.observed_conditions import standard_errors
 from design.targets.readings import readings_of
 from torchfilm import checks
 
+ENDS = (0.05, 0.5, 0.95)  # quantiles that a picture shows
+ROW = 0.17  # inches of a row in a picture
 LIKELY = 3.0  # a loss of simulations above that of a right model and a posterior as it should be
 WIDE = (
     ", of a right model and a narrow posterior about 2: give infer rounds=2 or more simulations, or"
@@ -89,15 +91,18 @@ class Prediction:
         return tf.displays.Text("\n".join(lines))
 
     def plot(self, out: str | Path | None = None) -> tf.pictures.Picture:
-        """Draw measured numbers, and the middle 90 % of the predicted ones, over time or dose. out:
-        as for `Best.plot`. Needs matplotlib (the `app` extra). Raises InputError where cells were
-        observed, and not numbers: `table()` lists these."""
+        """Draw what was observed, and the middle 90 % of what is predicted: measured numbers over
+        time or dose; of cells a row for each statistic, by how many standard errors of the data it
+        is predicted to be off. out: as for `Best.plot`. Needs matplotlib (the `app` extra)."""
         readings = readings_of(getattr(self.observed, "conditions", self.observed))
+        names, ends = self.observed.plan.names, np.quantile(self.statistics, ENDS, axis=0).T
         if not readings:
-            rule = "of measured numbers: Measured, a course or conditions of these"
-            raise checks.input_error("observed", self.observed.describe(), rule, "Print table().")
-        ends = np.quantile(self.statistics, [0.5, 0.05, 0.95], axis=0).T.tolist()
-        values = {n: (a, b, c) for n, (a, b, c) in zip(self.places, ends, strict=True)}
+            error = standard_errors(self.observed)[:, None]
+            apart = (ends - np.array(self.observed.values)[:, None]) / error
+            figure = tf.pictures.new_figure(6.4, 1.2 + ROW * len(names))
+            draw_pulls(figure.subplots(), dict(zip(names, apart.tolist(), strict=True)))
+            return tf.pictures.Picture(figure, out)
+        values = {n: (b, a, c) for n, (a, b, c) in zip(names, ends.tolist(), strict=True)}
         panels = len(measures_of(readings))
         figure = tf.pictures.new_figure(3.8 * panels, 3.6)
         axes: Any = figure.subplots(1, panels, squeeze=False)[0]
