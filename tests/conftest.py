@@ -29,6 +29,8 @@ DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 def pytest_collection_finish(session):
     """Two workers of a whole run share the kernels of contacts, and find what the other compiled.
     Else both would come to the same ones at the same time, and compile them all."""
+    gc.collect()
+    gc.freeze()  # a million objects of the collection, at which `gc` need not look again
     worker = getattr(session.config, "workerinput", {}).get("workerid")
     contacts = {"gw0": "one-sided", "gw1": "bilateral"}.get(worker)
     if contacts is None or len(session.items) < MANY_TESTS:
@@ -61,8 +63,6 @@ def new_objects():
     look at all of them takes seconds."""
     gc.collect()
     gc.freeze()
-    yield
-    gc.unfreeze()
 
 
 @pytest.fixture(params=DEVICES)
