@@ -219,3 +219,14 @@ def test_the_lineage_of_a_run_is_that_of_its_tracks(tmp_path):
     assert born[later] == pytest.approx(theirs[later])
     ended, theirs = (t.ended[k] for t, k in zip((tree, whole), order, strict=True))
     assert ended == pytest.approx(theirs, nan_ok=True)
+
+
+def test_numbers_that_are_no_labels_are_refused(tmp_path):
+    for parent in (float("inf"), 1e300):
+        with pytest.raises(InputError, match=r"row 2, column 'parent'.*must be a whole number"):
+            tf.Lineage.from_table({"cell": [1, 2], "parent": [-1, parent], "time_h": [0.0, 1.0]})
+    path = tmp_path / "man_track.txt"
+    for text in ("99999999999999999999 0 1 0", "-1 0 5 0\n2 6 9 -1", "0 0 5 0", f"{2**40} 0 1 0"):
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(InputError, match="whole numbers"):
+            tf.Lineage.from_ctc(path, interval=0.1)

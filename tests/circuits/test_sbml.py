@@ -313,3 +313,23 @@ def test_a_compartment_that_grows_dilutes_what_is_in_it():
 def test_long_sums_are_read():
     text = f"species A; A = 1; A' = {' + '.join(['A'] * 1000)}"
     assert float(tf.Circuit.from_antimony(text).graph.evaluate({"A": 1.0})["A"]) == 1000
+
+
+def test_a_first_value_from_a_rate_follows_the_parameters_that_are_given():
+    body = (
+        '<listOfCompartments><compartment id="c" size="1" constant="true"/></listOfCompartments>'
+        '<listOfSpecies><species id="A" compartment="c" initialConcentration="3"'
+        ' hasOnlySubstanceUnits="false" boundaryCondition="false" constant="false"/>'
+        '<species id="B" compartment="c" hasOnlySubstanceUnits="false" boundaryCondition="false"'
+        ' constant="false"/></listOfSpecies><listOfInitialAssignments>'
+        '<initialAssignment symbol="B"><math><ci>R1</ci></math></initialAssignment>'
+        '</listOfInitialAssignments><listOfReactions><reaction id="R1" reversible="false">'
+        '<listOfReactants><speciesReference species="A" stoichiometry="1" constant="true"/>'
+        "</listOfReactants><kineticLaw><math><apply><times/><ci>k</ci><ci>A</ci></apply></math>"
+        '<listOfLocalParameters><localParameter id="k" value="2"/></listOfLocalParameters>'
+        "</kineticLaw></reaction></listOfReactions>"
+    )
+    assert read(sbml(body)).initial["B"] == 6.0
+    assert read(sbml(body), R1_k=5.0).initial["B"] == 15.0
+    with pytest.raises(tf.InputError, match="computes first values from 'R1_k', so it must be one"):
+        read(sbml(body), R1_k={0: 5.0, 1: 2.0})

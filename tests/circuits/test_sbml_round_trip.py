@@ -106,6 +106,18 @@ def test_numbers_take_the_place_of_values_per_colony(tmp_path):
     assert again.parameters == {"k": 2.0} and again.initial == {"k": 1.0}
 
 
+def test_constants_of_one_cell_type_are_written(tmp_path):
+    """The rates are those of all cells."""
+    made = tf.Circuit(lambda u, s, p, cell: {"a": p.k - u.a}, species=("a",), k={0: 1.0, 1: 2.5})
+    made.to_sbml(tmp_path / "a.xml", cell_type=1)
+    assert tf.Circuit.from_sbml(tmp_path / "a.xml").parameters["k"] == 2.5
+    with pytest.raises(tf.InputError, match=r"cell_type = 3 is not allowed: .* one of 0, 1"):
+        made.to_sbml(tmp_path / "b.xml", cell_type=3)
+    same = tf.Circuit(lambda u, s, p, cell: {"a": p.k - u.a}, species=("a",), k=1.0)
+    with pytest.raises(tf.InputError, match="must be left out: nothing in the circuit"):
+        same.to_sbml(tmp_path / "c.xml", cell_type=0)
+
+
 def test_rates_of_one_cell_type_are_written(tmp_path):
     circuit = tf.Circuit(
         {0: decay, 3: lambda u, s, p, cell: {"k": p.k}}, species="k", k={0: 1.0, 3: 2.0}

@@ -175,3 +175,14 @@ def test_division_by_another_title_divides_as_early():
     assert division_times(SlowDivision(length=3.0), 14) == [4, 12]
     stages = [e.stage for e in tf.Scene(tf.Growth(), SlowDivision(length=3.0)).bind().effects]
     assert stages == [tf.effect.GROWTH, tf.effect.DIVISION]
+
+
+def test_thresholds_by_cell_type_are_inherited():
+    """Where types have numbers or inherited draws, each line keeps that of its founder."""
+    inherited = tf.Uniform(3.0, 4.5, inherited=True)
+    for threshold in (inherited, {0: inherited}, {0: inherited, 1: 3.5}):
+        founders = tf.Cells([[0.0, 0.0], [50.0, 0.0]], [[1.0, 0.0]] * 2, 2.0, cell_type=[0, 0])
+        division = tf.Division(length=threshold)
+        scene = tf.Scene(tf.Growth(rate=1.0), division, founders=founders, dt=0.05)
+        *_, state = tf.simulate(scene, until=3.0, seed=1)
+        assert state.cells >= 16 and state.division_threshold.unique().numel() == 2

@@ -164,11 +164,13 @@ def write_file(
             f"{circuit.value_owner()} has rates by cell type: say whose a model is to have, with"
             f" cell_type={' or '.join(map(str, kinds))}."
         )
-    if cell_type is None:
+    if cell_type is None or not kinds:  # rates that all cells have
         graph, part = circuit.graph, next(iter(circuit.rates.values()))
     else:
         checks.choice("cell_type", cell_type, tuple(circuit.rates))
         graph, part = circuit.graphs[cell_type], circuit.rates[cell_type]
+    if cell_type is not None and not kinds:
+        _check_type(cell_type, circuit)
     if circuit.shared:
         raise checks.InputError(
             f"{circuit.value_owner()} shares species of another circuit, so it is no whole model:"
@@ -186,6 +188,16 @@ def write_file(
         _numbers_of_cell(sbml.read_of_cell(sbml.names_read(graph)), cell),
     )
     sbml.write(path, text)
+
+
+def _check_type(cell_type: int, circuit: Circuit) -> None:
+    """Raise InputError for a type by which no number of a circuit goes."""
+    values = (*circuit.parameters.values(), *circuit.initial.values())
+    known = sorted({kind for x in values if isinstance(x, ByType) for kind in x.values})
+    if not known:
+        rule = "left out: nothing in the circuit goes by the type of cells"
+        raise checks.input_error("cell_type", cell_type, rule)
+    checks.choice("cell_type", cell_type, tuple(known))
 
 
 def _numbers_of_cell(names: Sequence[str], given: Mapping[str, float]) -> dict[str, float]:

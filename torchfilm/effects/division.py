@@ -99,14 +99,16 @@ class Division(Effect):
         name = self.criterion
         if name is not None:
             threshold = getattr(self, name)
-            reset = is_drawn(threshold) and not is_inherited(threshold)
+            # of numbers by type, those of a type that the division changes
+            drawn, by_type = is_drawn(threshold), isinstance(threshold, ByType)
+            reset = not is_inherited(threshold) if drawn else by_type
             fields.append(
                 Field(
                     "division_threshold",
                     f"{name} at which the cell divides",
                     "µm³" if name == "volume" else "µm",
                     initial=_FIRST_THRESHOLD[name],
-                    at_division="reset" if reset or isinstance(threshold, ByType) else "copy",
+                    at_division="reset" if reset else "copy",
                 )
             )
         if name == "added":

@@ -124,12 +124,15 @@ def challenge_tracks(path: str | Path, interval: float, join: bool) -> Tracks:
     try:
         rows = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
         numbers = np.array([[int(x) for x in row] for row in rows if row], np.int64)
-    except (ValueError, UnicodeDecodeError) as error:
+    except (ValueError, UnicodeDecodeError, OverflowError) as error:
         rule = "four whole numbers in each line: label, first frame, last frame, parent"
         raise InputError(f"{path} must have {rule} ({error}).") from error
     if numbers.ndim != 2 or numbers.shape[1] != 4:
         raise InputError(f"{path} must have four whole numbers in each line: L B E P.")
     cell, first, last, parent = numbers.T
+    if (cell < 1).any() or (parent < 0).any() or max(cell.max(), parent.max()) >= MOST_CELLS:
+        rule = f"from 1, below 2**{MOST_CELLS.bit_length() - 1}, and of no parent 0"
+        raise InputError(f"{path}: labels must be whole numbers {rule}.")
     none, nothing = np.full(len(cell), np.nan), np.zeros(len(cell), np.int64)
     if len(np.unique(cell)) < len(cell) or (last < first).any():
         raise InputError(f"{path}: each label must be there once, and end after it begins.")
@@ -201,7 +204,7 @@ def _parents(given: tables.Table, column: str, cell: np.ndarray) -> np.ndarray:
             number = float(text)
         except (TypeError, ValueError):
             number = np.nan
-        if number != np.round(number):
+        if not abs(number) < MOST_CELLS or number != np.round(number):
             rule = "a whole number, or empty where it has no parent"
             raise InputError(f"{given.place(row)}, column {column!r}: {text!r} must be {rule}.")
         values.append(int(number) if number > 0 or (number == 0 and (cell == 0).any()) else NONE)

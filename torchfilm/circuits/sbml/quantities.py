@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from torchfilm.circuits.equations import Term, numeric, operate
 from torchfilm.circuits.expressions import NUMBER, Builder, Expression, tangents
 from torchfilm.circuits.sbml.algebra import less, over
+from torchfilm.circuits.sbml.choices import Choices, plain
 from torchfilm.circuits.sbml.document import name_of
 from torchfilm.circuits.sbml.mathml import Formulas, calculate
 from torchfilm.tools.checks import InputError
@@ -20,28 +20,6 @@ IMPLIED = "default_compartment"  # of Antimony, where a model has none
 
 class NotConstant(Exception):
     """A formula that was to be a constant has a variable."""
-
-
-@dataclass(frozen=True)
-class Choices:
-    """What the user says of a model. signals: names of signals by id of species. cell: properties
-    of a cell by id. values, first: numbers in place of the model's, by id. without: reactions that
-    are left out. per_hour: the model's units of time in an hour. rename:
-    names in the circuit by id. cell_time: whether the time is that of the step's beginning."""
-
-    signals: Mapping[str, str]
-    cell: Mapping[str, Term]
-    values: Mapping[str, Any]
-    first: Mapping[str, Any]
-    without: frozenset[str]
-    per_hour: float
-    rename: Mapping[str, str]
-    cell_time: bool = False
-
-
-def plain(given: Any) -> bool:
-    """Whether a value is one number."""
-    return isinstance(given, (int, float)) and not isinstance(given, bool)
 
 
 class Quantities:
@@ -216,19 +194,27 @@ class Quantities:
 
     def law(self, name: str) -> float | Expression:
         """The rate of a reaction, in amounts per unit of the model's time."""
-        law = self.reactions[name].getKineticLaw()
-        if law is None or not law.isSetMath():
-            raise InputError(f"the reaction {name!r} has no kinetic law: give it one")
         own: dict[str, Term] = {}
+        for id_, key, given in self.own_parameters(name):
+            self.constants[key] = float(given) if plain(given) else 0.0
+            own[id_] = self.builder.name(f"p.{self.column(key)}")
+        return self.formulas.of(self.kinetic_law(name).getMath(), self, own)
+
+    def kinetic_law(self, reaction: str) -> Any:
+        law = self.reactions[reaction].getKineticLaw()
+        if law is None or not law.isSetMath():
+            raise InputError(f"the reaction {reaction!r} has no kinetic law: give it one")
+        return law
+
+    def own_parameters(self, reaction: str) -> Iterator[tuple[str, str, Any]]:
+        """Of a kinetic law: the id of each parameter there, that by which it is given, its value"""
+        law = self.kinetic_law(reaction)
         both = (law.getListOfParameters(), law.getListOfLocalParameters())
         for parameter in (x for part in both for x in part):
-            key = self.local(name, parameter.getId())
+            key = self.local(reaction, parameter.getId())
             if key not in self.choices.values and not parameter.isSetValue():
                 raise InputError(f"the parameter {parameter.getId()!r} has no value: give {key}=…")
-            given = self.choices.values.get(key, parameter.getValue())
-            self.constants[key] = float(given) if plain(given) else 0.0
-            own[parameter.getId()] = self.builder.name(f"p.{self.column(key)}")
-        return self.formulas.of(law.getMath(), self, own)
+            yield parameter.getId(), key, self.choices.values.get(key, parameter.getValue())
 
     def local(self, reaction: str, parameter: str) -> str:
         """The id under which a parameter of one kinetic law is known: unlike all others."""
@@ -321,10 +307,7 @@ class Quantities:
         chosen = self.choices.first if self.is_variable(name) else self.choices.values
         self.used.add(name)
         if name in chosen:
-            if not plain(chosen[name]):
-                what = f"the model computes first values from {name!r}, so it must be one number"
-                raise InputError(f"{what} here: give what depends on it by initial={{…}}")
-            return float(chosen[name])
+            return _one_number(name, chosen[name])
         at_start = _Start(self)
         for formula in (self.initial.get(name), self.assigned.get(name)):
             if formula is not None:
@@ -359,6 +342,13 @@ class Quantities:
         return found * size if amounts else found / size
 
 
+def _one_number(name: str, value: Any) -> float:
+    if not plain(value):
+        what = f"the model computes first values from {name!r}, so it must be one number"
+        raise InputError(f"{what} here: give what depends on it by initial={{…}}")
+    return float(value)
+
+
 class _Start:
     """What names stand for at the start: numbers."""
 
@@ -373,12 +363,9 @@ class _Start:
                 " initial={…}"
             )
         if name in quantities.reactions:
-            law, formulas = quantities.reactions[name].getKineticLaw(), quantities.formulas
-            if law is None or not law.isSetMath():
-                raise InputError(f"the reaction {name!r} has no kinetic law: give it one")
-            both = (law.getListOfParameters(), law.getListOfLocalParameters())
-            own: dict[str, Term] = {x.getId(): x.getValue() for part in both for x in part}
-            return formulas.of(law.getMath(), self, own)
+            each = quantities.own_parameters(name)
+            own: dict[str, Term] = {id_: _one_number(key, value) for id_, key, value in each}
+            return quantities.formulas.of(quantities.kinetic_law(name).getMath(), self, own)
         if name not in quantities.things:
             raise InputError(f"the formula reads {name!r}, which the model does not define")
         return quantities.first(name)

@@ -12,9 +12,10 @@ from torchfilm.circuits.expressions import Builder, Expression
 from torchfilm.circuits.names import unknown
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.circuits.sbml import molecules, own_marks, units
+from torchfilm.circuits.sbml.choices import Choices
 from torchfilm.circuits.sbml.document import open_model
 from torchfilm.circuits.sbml.mathml import Formulas, Function, calculate
-from torchfilm.circuits.sbml.quantities import CLOCK, PARAMETER, SPECIES, Choices, Quantities
+from torchfilm.circuits.sbml.quantities import CLOCK, PARAMETER, SPECIES, Quantities
 from torchfilm.tools.checks import InputError, input_error
 
 # Properties of a cell that an id of a model may stand for, with the power of µm that they are.
