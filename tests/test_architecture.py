@@ -53,6 +53,7 @@ ROOMS = {
             "torchfilm.spatial",
             "torchfilm.rule_values",
             "torchfilm.rule_draws",
+            "torchfilm.rule_surroundings",
             "torchfilm.rule_views",
         ),
     ),

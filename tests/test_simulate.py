@@ -268,6 +268,7 @@ def test_an_observers_error_closes_the_file(tmp_path):
 
 def test_timings_are_filled(tmp_path):
     timings, scene = tf.Timings(), scene_of()
+    assert repr(timings) == "Timings()"
     list(
         tf.simulate(
             scene, scene.bind().start(), until=0.5, timings=timings, record=tmp_path / "run.h5"
@@ -275,6 +276,7 @@ def test_timings_are_filled(tmp_path):
     )
     assert set(timings.seconds) == {"division", "growth", "mechanics", "recording"}
     assert all(0 < s < 60 for s in timings.seconds.values())
+    assert "recording: " in repr(timings) and " s)" in repr(timings)
 
 
 def test_nothing_runs_before_the_first_state_is_asked_for(tmp_path):

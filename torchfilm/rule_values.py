@@ -17,6 +17,7 @@ from torchfilm.tools.warn_once import warn
 def near_name(name: str, known: Sequence[str]) -> str:
     """A hint at the known name that is like this one, or ""."""
     near = difflib.get_close_matches(name, known, 1, cutoff=0.75)
+    near = near or [n for n in known if n.startswith(f"{name}_")]
     return f" Did you mean {near[0]!r}?" if near else ""
 
 

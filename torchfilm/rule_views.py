@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from torchfilm.circuits.names import Names
-from torchfilm.physics.nearby import gaps_nearby
 from torchfilm.rule_draws import Draws, OneCell
+from torchfilm.rule_surroundings import Surroundings
 from torchfilm.rule_values import (
     REMOVED_LATER,
     RuleError,
@@ -20,10 +20,8 @@ from torchfilm.rule_values import (
     broadcast_copy,
     check_integers,
     near_name,
-    real_column,
 )
 from torchfilm.state import CELL, CELL_TYPE, COLONY, OUTSIDE, Field, State
-from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import unchanged
 
 # The paper's names (Table 1) and ours.
@@ -34,6 +32,7 @@ PAPER_NAMES = {
     "growthRate": "growth_rate",
     "divideFlag": "divide_flag",
 }
+AXES = "xyz"
 GEOMETRY = ("position", "axis", "length", "radius", "volume", "area")
 # The fields of other effects that a read of a name depends on.
 MEANS = {
@@ -76,13 +75,14 @@ def _known_names(state: State) -> list[str]:
     return [*GEOMETRY, *IDENTITY, *fields]
 
 
-class CellsView(Draws):
+class CellsView(Draws, Surroundings):
     """The cells as a rule sees them: every name is a tensor over all cells, (N,) or (N, d).
 
-    `for cell in cells` gives them one by one (slow). A rule may read position (pos), axis (dir),
-    length, radius, volume, area, uid, parent, colony, signals, the constants p that its rules were
-    given, and every field of the scene. It may write fields, `divide_flag`, `remove_flag`, and new
-    names, which become variables of the cell. A tensor that was read may be changed in place.
+    `for cell in cells` gives them one by one (slow). A rule may read position (pos; x, y, z), axis
+    (dir), length, radius, volume, area, uid, parent, colony, signals, the constants p that its
+    rules were given, and every field of the scene. It may write fields, `divide_flag`,
+    `remove_flag`, and new names, which become variables of the cell. A tensor that was read may be
+    changed in place.
     """
 
     _state: State
@@ -160,6 +160,8 @@ class CellsView(Draws):
             self._read.add(name)
             # a copy, so that a rule may write into it: states are frozen
             self._work[name] = state.fields[name].clone()
+        elif name in AXES[: state.dim]:
+            return self.position[:, AXES.index(name)]
         elif self._declaring and name in KNOWN_FIELDS:
             self._work[name] = KNOWN_FIELDS[name].start(
                 state, torch.arange(state.cells, device=state.device)
@@ -170,12 +172,17 @@ class CellsView(Draws):
                     f"cells have no {name!r}; it is a signal: read cells.signals.{name}."
                 )
             known = _known_names(state)
+            near = near_name(name, [*known, *self._more_names()])
             raise RuleError(
-                f"cells have no {name!r}; they have {', '.join(known)}.{near_name(name, known)} A"
-                " variable of your own"
-                f" needs a first value: give Rules(…, variables={{{name!r}: 0.0}})."
+                f"cells have no {name!r}; they have {', '.join(known)}.{near} A variable of your"
+                f" own needs a first value: give Rules(…, variables={{{name!r}: 0.0}})."
             )
         return self._work[name]
+
+    def _more_names(self) -> list[str]:
+        """What else stands after `cells.`: flags, methods, and names of the paper."""
+        methods = [n for n in dir(type(self)) if not n.startswith("_")]
+        return [*PAPER_NAMES, *AXES[: self._state.dim], "remove_flag", *methods]
 
     def _signals(self) -> Names:
         """The concentration of each signal at each cell, (N,) by name: `cells.signals.ahl`."""
@@ -242,38 +249,6 @@ class CellsView(Draws):
     def __iter__(self):
         return (CellView(self, k) for k in range(self._state.cells))
 
-    def colony_max(self, value: Tensor) -> Tensor:
-        """The greatest value in each cell's own colony, (N,) -> (N,)."""
-        value = real_column("colony_max", value, self._state)
-        return self._state.groups.max(value).index_select(0, self._state.colony)
-
-    def colony_min(self, value: Tensor) -> Tensor:
-        """The smallest value in each cell's own colony, (N,) -> (N,)."""
-        return -self.colony_max(-real_column("colony_min", value, self._state))
-
-    def colony_sum(self, value: Tensor) -> Tensor:
-        """The sum over each cell's own colony, (N,) -> (N,); of a condition, how many fulfil it."""
-        value = real_column("colony_sum", value, self._state)
-        total = self._state.groups.sum(value)
-        return total.index_select(0, self._state.colony)
-
-    def contacts(self, within: float = 0.05) -> tuple[Tensor, Tensor]:
-        """Pairs of cells of one colony whose surfaces are at most `within` µm apart: two (P,)
-        tensors i, j of places among the cells.
-
-        Each pair occurs once, in either order: what goes from cell to cell both ways needs both
-        (i, j) and (j, i). The search runs only when a rule calls this.
-        """
-        if not (isinstance(within, (int, float)) and within >= 0):
-            raise checks.input_error("contacts(within)", within, "a distance in µm, 0 or more")
-        self._read.update(("position", "axis", "length", "radius"))
-        s = self._state
-        i, j, gap = gaps_nearby(
-            s.position, s.axis, s.length, s.radius, s.colony, s.colonies, within, s.space
-        )
-        keep = torch.nonzero(gap <= within).squeeze(1)
-        return i.index_select(0, keep), j.index_select(0, keep)
-
     def check_unharmed(self) -> None:
         """Raises RuleError if a rule wrote into a read-only name."""
         for name, shown in self._shown.items():
@@ -283,11 +258,6 @@ class CellsView(Draws):
                     f"the rule changed cells.{name} in place, which can only be read: rules change"
                     " fields, flags and variables."
                 )
-
-    def contact_count(self, within: float = 0.05) -> Tensor:
-        """The number of cells that each cell touches, (N,) int64."""
-        i, j = self.contacts(within)
-        return torch.bincount(torch.cat([i, j]), minlength=self._state.cells)
 
 
 class CellView:

@@ -50,8 +50,9 @@ class MediumReport:
     first: Tensor
     hint = (
         "Make the box of the Medium larger (one that is flat is a single layer), let it grow with"
-        " the colony, Medium(…, outside='grow'), remove cells before they leave it, as at the open"
-        " end of a channel, tf.Removal(low, high), or move the obstacle. A box has at most"
+        " the colony, Medium(…, outside='grow'), remove cells that come within 2 µm of its end,"
+        " tf.Removal(low, high) (in one step a cell may go further than its end), or move the"
+        " obstacle. A box has at most"
         f" {MOST_VOXELS / 1e6:.0f} million voxels; a larger spacing needs fewer"
     )
 

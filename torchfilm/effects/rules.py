@@ -22,11 +22,14 @@ from torchfilm.effect import RULES, Binding, BoundEffect, Effect
 from torchfilm.effects.bound_division_rule import DivisionRule
 from torchfilm.effects.bound_rules import MEANING, BoundRules
 from torchfilm.resolver import Values
+from torchfilm.rule_values import near_name
 from torchfilm.rule_views import OF_EFFECTS, CellsView, DivisionView
 from torchfilm.signals.schedule import warn_of_steps
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
+from torchfilm.tools.code_names import names_in
 from torchfilm.tools.hot_reload import HotReload, edited, load_functions
+from torchfilm.tools.warn_once import warn
 from torchfilm.values import CONSTANT, Rule, ScheduledValue, checked_constants
 
 
@@ -106,6 +109,19 @@ class Rules(Effect):
             raise checks.InputError(
                 "Rules.parameters are what rules read as cells.p, but the cells have a field 'p':"
                 " rename the field."
+            )
+        self._warn_of_unread()
+
+    def _warn_of_unread(self) -> None:
+        """Warn of constants that the code of no rule names."""
+        named = names_in(*(f for f in self.functions.values() if f is not None))
+        if named is None:
+            return
+        if unread := [name for name in self.parameters if name not in named]:
+            near = [near_name(name, sorted(named)) for name in unread]
+            warn(
+                f"Rules: {', '.join(map(repr, unread))} of parameters is read by no rule: a rule"
+                f" reads it as cells.p.{unread[0]}.{''.join(near)}"
             )
 
     def check_step(self, dt: float, divides: bool) -> None:

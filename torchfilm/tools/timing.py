@@ -15,6 +15,10 @@ class Timings:
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
 
+    def __repr__(self) -> str:
+        each = sorted(self.seconds.items(), key=lambda item: -item[1])
+        return f"Timings({', '.join(f'{name}: {s:.3g} s' for name, s in each)})"
+
     @contextmanager
     def of(self, name: str, device: torch.device) -> Iterator[None]:
         """Add the time of this block to `name`.
