@@ -5,6 +5,7 @@ Every constant is a number, one per colony, or a parameter's name.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -60,6 +61,23 @@ class _Enzyme:
         x = concentration(self.substrate, u, s)
         rate, half = (per_cell(c, p, cell, x) for c in (self.rate, self.half))
         return rate * concentration(self.enzyme, u, s) * kinetics.michaelis_menten(x, half)
+
+
+@dataclass(frozen=True, eq=False)
+class _Stage:
+    """One of `stages` equal steps that take `time` in all: stages/time × concentration."""
+
+    source: str
+    time: Constant
+    stages: int
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return (self.source,)
+
+    def __call__(self, u: Names, s: Names, p: Names, cell: Names) -> Tensor:
+        x = concentration(self.source, u, s)
+        return self.stages / per_cell(self.time, p, cell, x) * x
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +161,21 @@ def conversion(
             law,
             f"{substrate} converted by {enzyme}",
         )
+    ]
+
+
+@checks.known_keywords
+def maturation(immature: str, mature: str, *, time: Constant, stages: int = 1) -> list[Reaction]:
+    """immature → mature after `time`, h, on average: such as a fluorescent protein, or the delay of
+    a model in one equation. With more than one of `stages`, the steps between are the species
+    IMMATURE_2, IMMATURE_3, …; each takes as long, so that the time varies by 1/√stages (the linear
+    chain of MacDonald, Time Lags in Biological Models, 1978). Growth dilutes all stages."""
+    checks.integer("maturation.stages", stages, least=1)
+    time = constant("maturation.time", time, positive=True)
+    names = [immature, *(f"{immature}_{k}" for k in range(2, stages + 1)), mature]
+    return [
+        Reaction({one: 1}, {other: 1}, _Stage(one, time, stages), f"{one} to {other}", order=1)
+        for one, other in itertools.pairwise(names)
     ]
 
 
