@@ -12,6 +12,7 @@ from helpers import step
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchfilm as tf
+from torchfilm import rule_surroundings
 from torchfilm.effect import Effect
 
 
@@ -86,9 +87,17 @@ def test_without_mechanics_no_pair_is_looked_for_and_nothing_is_solved():
     assert heavy(operators(tf.Growth(rate=1.0), contacts)), "this test must be able to see them"
 
 
-def test_rules_that_do_not_ask_for_contacts_do_not_pay_for_them():
+def test_rules_that_do_not_ask_for_contacts_do_not_pay_for_them(monkeypatch):
+    found, search = [], rule_surroundings.pairs_within
+    monkeypatch.setattr(
+        rule_surroundings, "pairs_within", lambda *given: found.append(1) or search(*given)
+    )
     assert not heavy(operators(tf.Rules(lambda cells: setattr(cells, "big", cells.volume > 3))))
-    assert heavy(operators(tf.Rules(lambda cells: setattr(cells, "near", cells.contact_count()))))
+    assert not found
+    assert not heavy(
+        operators(tf.Rules(lambda cells: setattr(cells, "near", cells.contact_count())))
+    )
+    assert found
 
 
 def test_an_effect_that_is_not_listed_leaves_no_field_and_no_report():

@@ -380,15 +380,15 @@ def correlation(state: State, name: str | Tensor, edges: row_checks.Numbers) -> 
 @one_torch_thread()
 @torch.no_grad()
 def neighbours(state: State, gap: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs of cells of one colony whose surfaces are less than `gap` µm apart, each pair once.
+    """Pairs of cells of one colony whose surfaces are at most `gap` µm apart, each pair once.
 
     Returns first and second, (P,) int64, and the distance of their centres, (P,) float64 µm. A
     colony's pairs and their order do not depend on the rest of the batch. In a periodic space cells
     at opposite faces are neighbours, too.
     """
     checks.number("neighbours(gap)", gap, least=0.0)
-    cells = state.position, state.axis, state.length, state.radius, state.colony, state.colonies
-    i, j = pairs_within(*cells, gap, state.space)
+    cells = state.position, state.axis, state.length, state.radius
+    i, j = pairs_within(*cells, state.groups, gap, state.space)
     between = (state.position.index_select(0, j) - state.position.index_select(0, i)).T
     if state.space is not None:
         between = between + state.space.shift(between)
@@ -427,7 +427,7 @@ def clusters(state: State, gap: float, name: str | None = None) -> Tensor:
 @of_a_state
 @torch.no_grad()
 def alike_neighbours(state: State, gap: float, name: str = "cell_type") -> Tensor:
-    """The share of a colony's pairs of neighbours, less than `gap` µm apart, that are of one kind:
+    """The share of a colony's pairs of neighbours, at most `gap` µm apart, that are of one kind:
     (B,) float64, NaN without pairs. Kinds of one size that are well mixed come to 1 −
     `heterozygosity`, but for 1/N, and kinds that have sorted to nearly 1; large cells beside small
     ones have more neighbours each. name: a field of whole numbers, as for `strains`.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.film_shape import below_top_of
-from torchfilm.physics.nearby import gaps_nearby
+from torchfilm.physics.nearby import pairs_within
 from torchfilm.rule_values import real_column
 from torchfilm.state import State
 from torchfilm.tools import checks
@@ -53,11 +53,8 @@ class Surroundings:
             raise checks.input_error("contacts(within)", within, "a distance in µm, 0 or more")
         self._read.update(("position", "axis", "length", "radius"))
         s = self._state
-        i, j, gap = gaps_nearby(
-            s.position, s.axis, s.length, s.radius, s.colony, s.colonies, within, s.space
-        )
-        keep = torch.nonzero(gap <= within).squeeze(1)
-        return i.index_select(0, keep), j.index_select(0, keep)
+        shape = s.position, s.axis, s.length, s.radius
+        return pairs_within(*shape, s.groups, float(within), s.space)
 
     def contact_sum(self, value: Tensor, within: float = 0.05) -> Tensor:
         """The sum of a value over the cells that each cell touches, (N,) -> (N,); of a condition,

@@ -86,7 +86,7 @@ class BoundSloughing(BoundEffect):
     def _loose(self, state: State) -> Tensor:
         """The cells that nothing holds, (N,) bool."""
         gap, shape = self.effect.gap, (state.position, state.axis, state.length, state.radius)
-        pairs = pairs_within(*shape, state.colony, state.colonies, gap, state.space)
+        pairs = pairs_within(*shape, state.groups, gap, state.space)
         of = components(*pairs, state.cells)
         reach = state.radius.double() + gap
         at_walls = depth_in_surfaces(self.surfaces, *shape[:3], reach, state.own_colony_id) > 0

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
+import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.physics.compiled import DEGREES
 from torchfilm.physics.contacts import Capsules, contact_gaps
 from torchfilm.physics.neighbours import Neighbourhood
 from torchfilm.physics.space import PeriodicSpace, near_images
+from torchfilm.tools.numba_calls import as_array, unavailable
+from torchfilm.tools.ragged import Groups
+
+PAIRS_EACH = 4  # for which there is room at first, a cell
+_called: set[int] = set()  # dimensions in which the kernel has been called
 
 
 @torch.no_grad()
@@ -45,22 +54,43 @@ def gaps_nearby(
     return key // count, key % count, least
 
 
+@torch.no_grad()
 def pairs_within(
     position: Tensor,
     axis: Tensor,
     length: Tensor,
     radius: Tensor,
-    colony: Tensor,
-    colonies: int,
-    gap: float,
+    groups: Groups,
+    within: float,
     space: PeriodicSpace | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Pairs of one colony whose surfaces are less than `gap` µm apart: first and second, (P,). The
-    rest as for `gaps_nearby`."""
-    cells = position, axis, length, radius, colony, colonies
-    first, second, apart = gaps_nearby(*cells, within=gap, space=space)
-    near = torch.nonzero(apart < gap).squeeze(1)
-    return first.index_select(0, near), second.index_select(0, near)
+    """Pairs of one colony whose surfaces are at most `within` µm apart: first and second, (P,), by
+    a kernel where there can be one. groups: the cells of each colony, which stand side by side. The
+    rest as for `gaps_nearby`. A colony has the same pairs in the same order whatever the batch; one
+    with numbers that are not finite has none there."""
+    cells = position, axis, length, radius
+    if position.device.type != "cpu" or space is not None or unavailable():
+        i, j, gap = gaps_nearby(*cells, groups.owner, groups.size, within, space)
+        keep = torch.nonzero(gap <= within).squeeze(1)
+        return i.index_select(0, keep), j.index_select(0, keep)
+    from torchfilm.kernels.compiling import first_call
+    from torchfilm.kernels.memory import kept
+    from torchfilm.kernels.nearby import close_pairs
+
+    dim, count, found = position.shape[1], len(length), np.zeros(1, np.int64)
+    x, along, half, wide = (as_array(v, torch.float64) for v in (position, axis, length, radius))
+    given = groups.begin.numpy(), x, along, 0.5 * half, wide, float(within)
+    size = PAIRS_EACH * count
+    while True:
+        first, second = np.empty((2, size), np.int64)
+        name = f"neighbours, {dim}-D"
+        with nullcontext() if dim in _called else first_call(name, f"{name}, some seconds"):
+            kept.call(close_pairs, *given, first, second, found, DEGREES[dim])
+        _called.add(dim)
+        if found[0] <= size:
+            one, other = (torch.from_numpy(side[: found[0]]) for side in (first, second))
+            return one, other
+        size = int(found[0])
 
 
 def _capsules(position: Tensor, axis: Tensor, length: Tensor, radius: Tensor) -> Capsules:
