@@ -20,6 +20,7 @@ from torchfilm.effects.motility import Motility
 from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
+from torchfilm.effects.scaled import Scaled
 from torchfilm.effects.signal import Signal
 from torchfilm.effects.sloughing import Sloughing
 from torchfilm.initial_cells import Cells
@@ -126,6 +127,7 @@ __all__ = [
     "Results",
     "Robin",
     "Rules",
+    "Scaled",
     "Scene",
     "Schedule",
     "Settings",

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchfilm.effect import Binding
 from torchfilm.effects.medium_values import Corner, on_grid, without_cells
+from torchfilm.effects.scaled import Scaled, scaled
 from torchfilm.resolver import snapshot
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.grid import Grid, GridBatch
@@ -33,7 +34,7 @@ from torchfilm.values import Distribution, numbers
 
 if TYPE_CHECKING:
     from torchfilm.effects.medium import Medium
-    from torchfilm.effects.signal import Flow, OnGrid, Signal
+from torchfilm.effects.signal import Flow, OnGrid, Signal
 
 # Methods that are exact over a step, whatever its length.
 EXACT = ("exponential", "series")
@@ -361,7 +362,10 @@ def _velocity(flow: Flow, layout: Layout, batch: GridBatch, own: Callable[[Any],
             for v in (*flow, 0.0)[:3]
         ]
         return torch.stack(parts, 1)
-    return layout.on_faces(flow, batch)
+    factor = lambda x: torch.as_tensor(own(x), device=layout.grid.origin.device).reshape(
+        -1, 1, 1, 1
+    )
+    return tuple(scaled(flow, found, factor) for found in layout.on_faces(flow, batch))
 
 
 def _closure_tensors(signal: Signal, flow: Flow) -> list[Tensor]:
@@ -371,7 +375,10 @@ def _closure_tensors(signal: Signal, flow: Flow) -> list[Tensor]:
 
 
 def held_tensors(function: Callable[..., Any]) -> list[Tensor]:
-    """Tensors in the closure of a function."""
+    """Tensors in the closure of a function, and by which it is scaled."""
+    if isinstance(function, Scaled):
+        factor = [function.factor] if isinstance(function.factor, Tensor) else []
+        return [*factor, *held_tensors(function.function)]
     cells = getattr(function, "__closure__", None) or ()
     return [cell.cell_contents for cell in cells if isinstance(cell.cell_contents, Tensor)]
 

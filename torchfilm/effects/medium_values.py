@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from torchfilm.effects.scaled import scaled
 from torchfilm.signals.schedule import ROUNDING, Schedule
 from torchfilm.state import State
 from torchfilm.tools import checks, random
@@ -49,6 +50,8 @@ def on_grid(
                 shown,
                 f"a tensor of shape ({layout.grid.nodes},), one number for each position",
             )
+        each = lambda x: _of_colonies(x, state).expand(state.colonies)[layout.grid.owner]
+        found = scaled(given, found, each)
         bad = torch.nonzero(~((found >= 0) & (found < torch.inf))).squeeze(1)
         if bad.numel():
             where = [round(x, 3) for x in layout.grid.centres()[bad[0]].tolist()]
