@@ -138,6 +138,7 @@ def test_physical_softness_and_molecules_are_no_knobs():
     grown = tf.Settings(rtol=1e-2).apply(tf.Scene(tf.Growth(rate=1.0), molecules))
     assert of(grown, tf.Circuit) is molecules
     assert molecules.without_noise().method == "rosenbrock" and molecules.method == "tau_leap"
+    assert molecules.without_noise().daughters == "amount"
 
 
 def test_one_penalty_for_drags_that_differ_between_colonies():

@@ -231,6 +231,19 @@ def test_noise_is_that_of_photons_and_camera(run, tmp_path):
     assert not np.array_equal(image, other)
 
 
+def test_each_channel_has_noise_of_its_own(run, tmp_path):
+    """Far from cells, where both have the same light: of 40,000 pixels that are independent the
+    correlation is 0 to five standard errors."""
+    image = tifffile.imread(
+        run.to_ome_tiff(
+            tmp_path / "a.ome.tif", pixel_size=0.2, colony=0, channels={"gfp": 1.0, "out.ahl": 1.0},
+            frames=[0], noise=5.0, background=50.0, window=((50.0, 50.0), (90.0, 90.0)),
+        )
+    )  # fmt: skip
+    first, second = image.reshape(2, -1).astype(float)
+    assert first.size == 40000 and abs(np.corrcoef(first, second)[0, 1]) < 5 / 200
+
+
 def test_noise_does_not_depend_on_what_else_is_written(run, tmp_path):
     common = {"pixel_size": 0.2, "colony": 1, "noise": 3.0, "window": ((-9, -9), (9, 9))}
     all_of_it = tifffile.imread(

@@ -118,6 +118,21 @@ def test_signals_lie_where_the_cells_are(run):
     assert known[-1] > known[0], "these grids grow"
 
 
+def test_colonies_are_moved_by_whole_voxels(tmp_path):
+    """Also where a cell beyond the box makes a colony as wide as no number of voxels."""
+    cells = tf.Cells([[0.0, 0.0], [17.3, 8.7]], [[1.0, 0.0]] * 2)
+    medium = tf.Medium(
+        ahl=tf.Signal(diffusion=10.0, initial=1.0), spacing=2.0, box=((-4, -4), (4, 4)),
+        outside="reservoir",
+    )  # fmt: skip
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2), medium, founders=cells, dt=0.1)
+    results = recorded(scene, tmp_path / "run.h5", 0.2, colonies=3, every=1)
+    _, signals = results.to_vtkhdf(tmp_path / "a.vtkhdf")
+    with h5py.File(signals) as file:
+        voxels = file["torchfilm/shift"][...] / file["VTKHDF"].attrs["Spacing"]
+    assert np.allclose(voxels, np.round(voxels), atol=1e-6) and (abs(voxels[1:]).max(1) > 5).all()
+
+
 def test_some_colonies_and_frames_as_lines(run, tmp_path):
     results = run[0]
     path, _ = results.to_vtkhdf(tmp_path / "a.vtkhdf", colonies=[1], frames=[0, -1], rods="lines")

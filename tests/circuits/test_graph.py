@@ -165,6 +165,8 @@ WRITTEN = {
     "a·(−b)": lambda a, b, c: a * -b,
     "a − (−b)": lambda a, b, c: a - -b,
     "a − b": lambda a, b, c: a + -b,
+    "a + 2": lambda a, b, c: a - -2.0,
+    "a·(b + 2)": lambda a, b, c: a * (b - -2.0),
     "−2·a − 1": lambda a, b, c: a * -2.0 + -1.0,
     "−(−a)": lambda a, b, c: (-a).neg(),
     "(a + b)^c": lambda a, b, c: (a + b) ** c,
@@ -304,6 +306,10 @@ def test_conserved_sums():
     assert same(exchange.graph.conserved, {"ahl": 1, "out.ahl": 1})
     pair = tf.Circuit([tf.Reaction.of("2 a -> 3 b", 1.0)], species=("a", "b"))
     assert same(pair.graph.conserved, {"a": 3, "b": 2})
+    # the signs are such that the numbers add up to more than 0, or the first is above 0
+    for count, sums in ((2, {"a": -1, "b": 2}), (1, {"a": 1, "b": -1})):
+        made = [tf.Reaction({}, {"a": count, "b": 1}, 1.0)]
+        assert tf.Circuit(made, species=("a", "b")).graph.conserved == [sums]
     leaking = [*parts.degradation("a", "k"), tf.Reaction.of("a -> b", 1.0)]
     assert tf.Circuit(leaking, species=("a", "b"), k=1.0).graph.conserved == []
 

@@ -104,6 +104,12 @@ def test_stoichiometry():
     assert net.orders.tolist() == [2, 2, 0, 1]
 
 
+@pytest.mark.parametrize("power, order", [(0.5, 1), (1.0, 1), (1.5, 2), (2, 2), (2.1, 3), ("n", 4)])
+def test_the_order_of_a_promoter_is_its_power_rounded_up(power, order):
+    for part in (activated, repressed):
+        assert part("a", "b", 1.0, 1.0, power=power)[0].order == order
+
+
 def test_equations_are_read():
     r = Reaction.of("2 a + b -> c + out.x + a", rate="k")
     assert dict(r.consumes) == {"a": 2, "b": 1} and dict(r.produces) == {"c": 1, "out.x": 1, "a": 1}

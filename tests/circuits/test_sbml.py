@@ -199,6 +199,22 @@ def test_litres_become_cubic_micrometres():
     close(rates["A"], 1.5)
 
 
+def test_roots_of_litres_become_micrometres():
+    """The edge of a litre is a tenth of a metre, 1e5 µm."""
+    body = (
+        '<listOfUnitDefinitions><unitDefinition id="edge"><listOfUnits><unit kind="litre"'
+        f' exponent="{1 / 3!r}" scale="0" multiplier="1"/></listOfUnits></unitDefinition>'
+        '</listOfUnitDefinitions><listOfCompartments><compartment id="c" size="1" constant="true"/>'
+        '</listOfCompartments><listOfSpecies><species id="A" compartment="c" initialAmount="1"'
+        ' hasOnlySubstanceUnits="true" boundaryCondition="false" constant="false"/></listOfSpecies>'
+        '<listOfParameters><parameter id="l" value="1" units="edge" constant="true"/>'
+        '</listOfParameters><listOfRules><rateRule variable="A"><math><ci>l</ci></math></rateRule>'
+        "</listOfRules>"
+    )
+    rates = read(sbml(body), properties={"l": "length"}).graph.evaluate({"cell.length": 3.0})
+    assert float(rates["A"]) == pytest.approx(3e-5)
+
+
 @pytest.mark.parametrize(
     "unit, factor", [("s", 3600), ("min", 60), ("h", 1), ("day", 1 / 24), (None, 1)]
 )
@@ -236,6 +252,9 @@ FORMULAS = {
     "floor(-7*x)": lambda x: np.floor(-7 * x), "factorial(4)*x": lambda x: 24 * x,
     "max(x, 0.3, 2*x)": lambda x: max(0.3, 2 * x), "min(x, 0.3)": lambda x: min(x, 0.3),
     "rem(-7*x, 2)": lambda x: np.fmod(-7 * x, 2), "quotient(-7*x, 2)": lambda x: np.trunc(-3.5 * x),
+    "rem(7*x, -2)": lambda x: np.fmod(7 * x, -2), "quotient(7*x, -2)": lambda x: np.trunc(-3.5 * x),
+    "rem(-7*x, -2)": lambda x: np.fmod(-7 * x, -2),
+    "quotient(-7*x, -2)": lambda x: np.trunc(3.5 * x),
     "piecewise(1, x > 0.5 && x < 0.7, 2, x == 0.25, 3)": lambda x: {0.25: 2, 0.6: 1}.get(x, 3),
     "piecewise(1, xor(x > 0.5, x > 0.2), 0)": lambda x: float(0.2 < x <= 0.5),
     "piecewise(1, !(x > 0.5) || x > 0.7, 0)": lambda x: float(x <= 0.5 or x > 0.7),

@@ -266,6 +266,21 @@ def test_molecules_through_the_membrane_are_conserved(method, outside, dtype):
         )
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_reservoir_is_not_emptied_by_the_cells_in_it(method):
+    """Cells beyond the box come to the reservoir's 50 molecules/µm³ in one step of ten times V/A
+    over 1 µm/h: 105 in each, with Poisson's variance; 40 cells, 5 standard errors."""
+    circuit = tf.Circuit([tf.parts.exchange("a", 1.0)], species=("a",), method=method)
+    medium = tf.Medium(a=tf.Signal(1.0, reservoir=50.0), outside="reservoir", **BOX)
+    beyond = tf.Cells([[100.0, 2.0 * k] for k in range(40)], [[1.0, 0.0]] * 40)
+    scene = tf.Scene(circuit, medium, founders=beyond)
+    state = scene.bind(dtype=F64).start(seed=1)
+    after = advance(scene, state, 1, dt=10.0 * float(state.volume[0] / state.area[0]))
+    mean = 50.0 * float(state.volume[0])
+    found = float(molecules(after, "a").mean())
+    assert found == pytest.approx(mean, abs=5 * math.sqrt(mean / 40))
+
+
 def test_uptake_of_the_last_molecules_leaves_nothing_negative():
     """Hard case 39 molecule by molecule: at k·dt = 1e3, cells in one voxel take what there is, and
     less than a molecule stays."""

@@ -213,6 +213,12 @@ def test_genes_that_a_division_loses_are_warned_of():
     assert float(genes.sum()) == 4  # one a colony, as ever
 
 
+@pytest.mark.parametrize("options", [{"copies": 2}, {"replicated": ("on",)}])
+def test_two_copies_and_states_that_are_not_all_replicated_are_warned_of(options):
+    with pytest.warns(UserWarning, match=r"number of off \+ on"):
+        next(tf.simulate(telegraph(**options), until=0.1))
+
+
 def test_genes_of_one_type_of_cells_are_seen():
     """Where few of the founders have it."""
     founders = tf.Cells(
@@ -246,7 +252,7 @@ def test_genes_that_a_rule_copies_are_not_warned_of():
 def test_many_molecules_or_no_division_are_not_warned_of():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        tf.Scene(*telegraph(copies=30).effects, dim=2, dt=0.02).bind()
+        next(tf.simulate(telegraph(copies=30), until=0.1))
         alone = [e for e in telegraph().effects if not isinstance(e, tf.Division)]
         next(tf.simulate(tf.Scene(*alone, dim=2, dt=0.02), until=0.1))
 

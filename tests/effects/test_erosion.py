@@ -209,6 +209,23 @@ def test_a_wall_on_any_side_holds():
     assert step(scene, scene.bind().start(), 0.01).cells == 2
 
 
+def test_a_gap_is_as_wide_beside_a_wall_as_between_cells():
+    """The surface of a cell 0.45 µm above the wall, and of one 0.75 µm above it."""
+    near, far = (tf.Cells([[3.0, y]], [[1.0, 0.0]], 2.0) for y in (0.95, 1.25))
+    assert film(tf.Sloughing(gap=0.5), cells=near).bind().start().cells == 1
+    with pytest.raises(InputError, match=r"take cell 0 of colony 0 .*no chain of cells less"):
+        film(tf.Sloughing(gap=0.5), cells=far).bind()
+
+
+def test_a_wall_at_another_place_in_each_colony_holds_the_cells_of_its_own():
+    """Also where the batch has only some of the colonies."""
+    wall = tf.Plane(y=[0.0, 5.0], facing="+y")
+    cells = tf.Cells([[3.0, 0.5], [3.0, 5.5]], [[1.0, 0.0]] * 2, 2.0, colony=[0, 1])
+    scene = tf.Scene(tf.Mechanics(dim=2, walls=[wall]), tf.Sloughing(), founders=cells)
+    state = scene.bind(2).start().select([1])
+    assert scene.bind(state=state).step(state, 0.01).cells == 1
+
+
 @pytest.mark.parametrize(
     "given, words",
     [
@@ -234,6 +251,21 @@ def test_where_the_floor_ends_must_be_known():
     state = step(known, known.bind().start(), 1e4)
     # columns from 4 to 12 µm: the cells in the middle of which they end stay on the other side
     assert state.position[:, 0].tolist() == [2.0, 14.0, 18.0]
+
+
+def test_a_cell_beside_the_floor_does_not_change_what_erodes():
+    """It stands 0.6 µm beside the columns, above none of them: the others leave by the same draws,
+    as fast as without it."""
+    left = []
+    erosion = tf.Erosion(1.0, order=0.0, across={"x": (4.0, 12.0)})
+    for more in (0, 1):
+        first = layers(3)
+        position = np.concatenate([first.position, np.array([[3.4, 5.0]])[:more]])
+        axis = np.concatenate([first.axis, np.array([[0.0, 1.0]])[:more]])
+        scene = tf.Scene(erosion, founders=tf.Cells(position, axis, 2.0))
+        after = step(scene, scene.bind(50).start(seed=2), 0.5)
+        left.append(after.counts - more)
+    assert torch.equal(*left) and 0 < int(left[0].sum()) < 50 * 15
 
 
 def test_sloughing_needs_a_wall_and_first_cells_that_it_holds():

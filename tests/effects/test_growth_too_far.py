@@ -75,3 +75,16 @@ def test_where_no_cell_divides_it_may_be():
     scene = tf.Scene(*by_rule(3.0), dim=2, dt=0.05)
     *_, state = tf.simulate(scene, until=0.1)
     assert float(state.volume[0]) == pytest.approx(9 * math.pi * 0.25 * (2 + 2 / 3), rel=1e-5)
+
+
+def test_linear_growth_may_be_where_a_rule_decides_who_divides():
+    """2 µm become 6 µm in a step, and the rule may let such cells divide in each step."""
+
+    def update(cells):
+        cells.divide_flag = cells.length > 4.0
+
+    growth = tf.Growth(rate=4.0 / 0.05, law="linear")
+    scene = tf.Scene(tf.Rules(update), growth, tf.Division(), dim=2, dt=0.05)
+    model = scene.bind()
+    state = model.step(model.start())
+    assert not tf.failures(state) and float(state.length[0]) == pytest.approx(6.0)

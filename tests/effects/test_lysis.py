@@ -228,6 +228,18 @@ def test_the_report_has_every_signal_in_every_step():
     assert report.burst.tolist() == [0, 0] and report.released["a"].tolist() == [0.0, 0.0]
 
 
+def test_the_report_has_what_several_release_to_one_signal():
+    scene = tf.Scene(
+        tf.Lysis("length", above=2.5, releases={"a": 3.0}),
+        tf.Lysis("length", above=1.5, releases={"a": 5.0}), medium("a"),
+        founders=tf.Cells(FOUR.position, FOUR.axis, length=[1.0, 2.0, 3.0, 4.0]),
+    )  # fmt: skip
+    state = step(scene, scene.bind(2).start(), 0.1)
+    found, report = totals(state, "a", inside=False), state.reports["lysis"]
+    assert report.burst.tolist() == [3, 3] and report.released["a"].tolist() == [11.0, 11.0]
+    assert found.tolist() == pytest.approx([11.0, 11.0], rel=1e-5)
+
+
 def test_who_bursts_does_not_depend_on_the_batch(tmp_path):
     scene = tf.Scene(
         tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2), holding(leaks),

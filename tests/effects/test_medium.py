@@ -283,6 +283,14 @@ def test_a_box_that_grows_along_x_only_says_where_else_it_ends():
         list(tf.simulate(scene, up, until=0.1, dt=0.1))
 
 
+def test_a_margin_counts_only_along_the_axes_that_grow():
+    """It makes 150,000 voxels of an axis: one such axis is allowed, and two are not."""
+    given = {"ahl": tf.Signal(5.0), "box": BOX, "spacing": 4.0, "outside": "grow", "margin": 3e5}
+    tf.Medium(grows="y", **given)
+    with pytest.raises(tf.InputError, match=r"Medium\.margin = 300000\.0.*at most 67 million"):
+        tf.Medium(grows="xy", **given)
+
+
 def test_a_cell_inside_an_obstacle_is_beyond_the_medium():
     scene = resting(
         tf.Medium(

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import torchfilm as tf
+from torchfilm.effects.medium_values import without_cells
 
 FAR = tf.Cells([[2.0, 2.0]], [[1.0, 0.0]])
 
@@ -140,6 +141,22 @@ def test_derivatives_by_a_decay_that_is_0():
     assert float(slope[0] / count[0]) == pytest.approx(-1.0 - 0.25, rel=1e-6)
     half = torch.tensor(0.5, dtype=torch.float64)
     assert float(slope[1] / count[1]) == pytest.approx(float(by_hand(half)), rel=1e-6)
+
+
+def test_derivatives_by_a_decay_that_is_0_over_several_periods():
+    """Of what three periods have made and a part of the fourth, by differences to second order."""
+    state = noisy(0.5, ((0, 0), (4, 4))).bind(dtype=torch.float64).start()
+
+    def grown(decay):
+        signal = tf.Signal(0.0, initial=0.5, decay=decay, source=PULSES)
+        return without_cells(signal, "m", state, (0.0, 0.0, 0.0), 3 * 0.75 + 0.4)[0]
+
+    decay = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(grown(decay), decay)
+    none, one, two = (float(grown(k)) for k in (0.0, 1e-3, 2e-3))
+    assert none == pytest.approx(0.5 + 3 * 0.5 + 2 * 0.15)
+    # the differences are off by h²/3 of the third derivative, which is about −20
+    assert float(slope) == pytest.approx((4 * one - two - 3 * none) / 2e-3, rel=1e-5)
 
 
 def test_parameters_of_a_distribution_may_be_stated_as_one_per_colony():

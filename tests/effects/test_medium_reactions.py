@@ -224,6 +224,16 @@ def test_what_runs_away_fails_and_names_its_colony():
         later(scene, 1.0, colonies=2)
 
 
+def test_what_fails_in_the_first_half_of_a_step_fails_the_colony():
+    """The second half goes well: in between the signal decays to less than a thousandth."""
+    scene = tf.Scene(
+        tf.MediumReactions(lambda s, p: {"a": p.k * s.a**2}, parameters={"k": [0.1, 50.0]}),
+        tf.Medium(a=tf.Signal(0.0, initial=1.0, decay=100.0), **BOX), dim=2,
+    )  # fmt: skip
+    with pytest.raises(tf.SimulationError, match=r"colony 1 .*in the medium, at \(.*'a' runs"):
+        later(scene, 0.1, colonies=2, dt=0.1)
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [

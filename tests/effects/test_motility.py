@@ -52,6 +52,18 @@ def test_reversals_too_often_for_the_step_are_told():
         last(tf.Scene(tf.Motility(1.0, reversals=50.0), founders=far_apart(2), dt=0.02), 0.04)
 
 
+def test_more_than_a_quarter_of_a_reversal_in_a_step_is_told_unless_a_factor_multiplies_it():
+    """The factor may be small, so that a rate of 0.5 in a step says nothing."""
+    often = tf.Motility(1.0, reversals=15.0)
+    with pytest.warns(UserWarning, match=r"reverses up to 0\.3 times in a step"):
+        last(tf.Scene(often, founders=far_apart(2), dt=0.02), 0.04)
+    seldom = tf.Motility(1.0, reversals=12.0)
+    last(tf.Scene(seldom, founders=far_apart(2), dt=0.02), 0.04)
+    by_factor = tf.Motility(1.0, reversals=25.0, reversal_factor="turns")
+    cells = far_apart(2, extra={"turns": [0.1, 0.1]})
+    last(tf.Scene(by_factor, founders=cells, dt=0.02), 0.04)
+
+
 def test_cells_that_reverse_spread_as_a_persistent_walk():
     """⟨x²⟩ = v²/k · (t − (1 − exp(−2kt))/(2k)), within four standard errors."""
     scene = tf.Scene(tf.Motility(20.0, reversals=3.0), founders=far_apart(1000), dt=0.02)

@@ -308,6 +308,13 @@ def test_a_step_in_which_a_fed_cell_more_than_doubles_is_refused():
         tf.simulate(scene, until=0.05)
 
 
+def test_the_tail_of_a_drawn_rate_may_be_too_fast_for_the_step():
+    """Few cells have it: only a smallest rate that is too fast is refused."""
+    rate = tf.LogNormal(1.0, 0.8)
+    assert rate.greatest() * 0.05 > math.log(2.0)
+    eating(tf.Monod("food", rate=rate), more=(tf.Division(length=3.0),)).bind().check_step(0.05)
+
+
 def test_a_factor_slows_growth_and_uptake():
     """Cells far apart, in plenty: the half-speed one eats what is worth half the growth."""
 
