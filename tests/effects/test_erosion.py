@@ -296,3 +296,23 @@ def test_a_state_on_a_gpu_erodes_by_the_bits_of_the_cpu(pretended_cuda):  # noqa
     growing = (tf.Growth(rate=rate), tf.Division(length=4.0))
     traced = film(*growing, *losing, tolerance=1e-5).bind(2, device="cuda")
     assert traced.step(traced.start(seed=2), 0.05).cells > 0  # by torch, where a gradient is wanted
+
+
+def test_one_long_step_takes_what_the_law_says_of_cells_at_all_angles():
+    """Where many cells lie over several columns, which come to light at different times: over 500
+    colonies, to four standard errors. The loss is a quarter of the film."""
+    rng = np.random.default_rng(0)
+    place = np.stack([rng.uniform(0, WIDTH, 200), rng.uniform(0.5, 24.0, 200)], 1)
+    angle = rng.uniform(0, math.pi, 200)
+    heap = tf.Cells(place, np.stack([np.cos(angle), np.sin(angle)], 1), 5.0)
+    across = {"x": (0.0, WIDTH)}
+    scene = tf.Scene(tf.Erosion(6.0, order=0.0, across=across), founders=heap)
+    model = scene.bind(500)
+    state = model.start(seed=3)
+    height = tf.measure.film(state, 0.5, across=across).height
+    there = (state.position[:, 0] >= 0) & (state.position[:, 0] < WIDTH)
+    volume = state.groups.sum(torch.where(there, state.volume.double(), 0.0))
+    law = 6.0 * (height > 0).sum(1) * volume / height.sum(1)
+    ratio = model.step(state, 1.0).reports["erosion"].volume / law
+    error = 4 * float(ratio.std()) / math.sqrt(500)
+    assert error < 0.03 and float(ratio.mean()) == pytest.approx(1.0, abs=error)

@@ -135,7 +135,8 @@ class Erosion(Effect):
             end = (draw + late) / hazard
             gone = gone | (end <= dt)
             bare = torch.nonzero(stacks.there & gone[top]).squeeze(1)
-            since[bare] = torch.maximum(since[bare], end[top[bare]])
+            # also where it is before the column bared the cell: its draw has this span as negative
+            since[bare] = end[top[bare]]
             exposed = stacks.below(bare, gone)
         return gone
 
