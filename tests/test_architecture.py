@@ -41,6 +41,7 @@ ROOMS = {
         3,
         (
             "torchfilm.values",
+            "torchfilm.bound_draw",
             "torchfilm.resolver",
             "torchfilm.distributions",
             "torchfilm.parameters",

@@ -38,6 +38,7 @@ def with_values_of_new_types(before: State, after: State, names: Iterable[str]) 
             value = after.fields[name]
             rows = torch.nonzero(new_type & (value == before.fields[name])).squeeze(1)
             if rows.numel():
-                first = after.declared[name].start(after, rows)
+                # as of first cells: what the parents have is of another type
+                first = after.declared[name].start(after.replace(births=()), rows)
                 changed[name] = value.index_copy(0, rows, first)
     return after.with_fields(**changed)

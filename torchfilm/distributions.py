@@ -10,7 +10,10 @@ from torch import Tensor
 
 from torchfilm.state import State
 from torchfilm.tools import checks
+from torchfilm.tools.deterministic_math import power
 from torchfilm.values import COLONY, Distribution, Rule, largest, numbers, smallest
+
+TAIL = 4.0  # standard deviations, beyond which draws are folded back
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +61,15 @@ class Normal(Distribution):
         z = _standard_normal(state, rows, purpose)
         return values.mean.of_rows(state, rows) + values.sd.of_rows(state, rows) * z
 
+    def draw_after(
+        self, parents: Tensor, state: State, rows: Tensor, purpose: str, values: Any
+    ) -> Tensor:
+        mean, sd = values.mean.of_rows(state, rows), values.sd.of_rows(state, rows)
+        share = values.inherited.of_rows(state, rows)
+        own = ((parents - mean) / torch.where(sd > 0, sd, 1.0)).clamp(-TAIL, TAIL)
+        z = share * own + _rest(share) * _standard_normal(state, rows, purpose)
+        return mean + sd * torch.where(z.abs() > TAIL, z.sign() * (2 * TAIL - z.abs()), z)
+
     def least(self) -> float:
         return float((numbers(self.mean) - 4 * numbers(self.sd)).min())
 
@@ -83,6 +95,19 @@ class LogNormal(Distribution):
         # (0 + 1 · z, as of a Normal of mean 0 and sd 1)
         return values.median.of_rows(state, rows) * torch.exp(values.sigma.of_rows(state, rows) * z)
 
+    def draw_after(
+        self, parents: Tensor, state: State, rows: Tensor, purpose: str, values: Any
+    ) -> Tensor:
+        median, sigma = values.median.of_rows(state, rows), values.sigma.of_rows(state, rows)
+        share = values.inherited.of_rows(state, rows)
+        most = torch.exp(TAIL * sigma)
+        own = (parents / median).clamp(1.0 / most, most)
+        drawn = torch.exp(_rest(share) * sigma * _standard_normal(state, rows, purpose))
+        found = power(own, share) * drawn
+        # the tails of the logarithm are folded back
+        found = torch.where(found > most, most * most / found, found)
+        return median * torch.where(found * most < 1, 1.0 / (most * most * found), found)
+
     def least(self) -> float:
         return float((numbers(self.median) * torch.exp(-4 * numbers(self.sigma))).min())
 
@@ -93,4 +118,10 @@ class LogNormal(Distribution):
 def _standard_normal(state: State, rows: Tensor, purpose: str) -> Tensor:
     """Standard normal draws (M,), the tails beyond 4 folded back inside."""
     z = state.normal(rows, purpose)[:, 0]
-    return torch.where(z.abs() > 4, z.sign() * (8 - z.abs()).clamp(min=0), z)
+    return torch.where(z.abs() > TAIL, z.sign() * (2 * TAIL - z.abs()).clamp(min=0), z)
+
+
+def _rest(share: Tensor) -> Tensor:
+    """The standard deviation of what is drawn beside the share that is inherited, so that all cells
+    together vary by 1."""
+    return (1.0 - share * share).sqrt()

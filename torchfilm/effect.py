@@ -297,8 +297,8 @@ class BoundEffect:
         found = {}
         for name, (value, rule) in effect.physical_values().items():
             field = kept[name].name if name in kept else None
-            typed = rule.scope == CELL
-            found[name] = resolve(f"{owner}.{name}", value, batch, field=field, typed=typed)
+            keep = {"field": field, "kept": field or effect.keeps().get(name)}
+            found[name] = resolve(f"{owner}.{name}", value, batch, **keep, typed=rule.scope == CELL)
         return found
 
     def declares(self) -> list[Field]:

@@ -7,7 +7,7 @@ changed later in place does not change a bound model.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -15,12 +15,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchfilm.bound_draw import BoundDraw, missing_type, of_parents
 from torchfilm.signals.schedule import Schedule
 from torchfilm.state import Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.parts import mapped
 from torchfilm.tools.tangents import has_tangent
-from torchfilm.values import ByType, Distribution, PerColony, is_drawn, is_inherited
+from torchfilm.values import (
+    ByType,
+    Distribution,
+    PerColony,
+    check_inherited,
+    is_drawn,
+    is_inherited,
+)
 
 
 @dataclass(frozen=True)
@@ -43,7 +51,7 @@ class BoundBatch:
 class Resolved:
     """A value of one batch. `value`: 0-dim, or (B,) by colony id, or for cell types (T,) or (T, B);
     None where it is drawn at birth and kept in the field `field`. types: (T,) int64, ascending.
-    draw: how it is drawn.
+    draw: how it is drawn. kept: the field in which cells keep it, whoever puts it there.
     """
 
     name: str
@@ -51,6 +59,7 @@ class Resolved:
     types: Tensor | None = None
     draw: BoundDraw | None = None
     field: str | None = None
+    kept: str | None = None
 
     @property
     def known_types(self) -> tuple[int, ...]:
@@ -97,7 +106,10 @@ class Resolved:
     def drawn(self, state: State, rows: Tensor, purpose: str | None = None) -> Tensor:
         """(M,) for the cells `rows` (M,), drawn now by the key `purpose`, or else by its name."""
         assert self.draw is not None
-        return self.draw(state, rows, purpose or self.name)
+        parents = None
+        if self.draw.takes_after and self.kept is not None:
+            parents = of_parents(state, rows, self.kept)
+        return self.draw(state, rows, purpose or self.name, parents)
 
     def needed_by(self, kinds: Collection[int]) -> Resolved:
         """The same value where only cells of these types need it. If it is drawn, and for just one
@@ -113,7 +125,7 @@ class Resolved:
         place = torch.searchsorted(self.types, kind).clamp(max=self.types.numel() - 1)
         wrong = self.types.index_select(0, place) != kind
         if bool(wrong.any()):
-            raise _missing_type(self.name, int(kind[wrong][0]), self.types.tolist())
+            raise missing_type(self.name, int(kind[wrong][0]), self.types.tolist())
         if self.value.dim() == 1:
             return self.value.index_select(0, place)
         ids = state.own_colony_id if rows is None else state.own_colony_id.index_select(0, rows)
@@ -170,69 +182,6 @@ class Scheduled(Resolved):
         return all(x.is_zero for x in self.each)
 
 
-@dataclass(frozen=True, eq=False)
-class BoundDraw:
-    """How the values of cells are drawn: by one distribution, or by one value for each cell type.
-    others: the type whose value cells of types without one get; None: there may be no such cells.
-    """
-
-    name: str
-    parts: tuple[
-        tuple[int | None, Any], ...
-    ]  # (cell type or None, Resolved or (Distribution, its resolved parameters))
-    others: int | None = None
-
-    def __call__(self, state: State, rows: Tensor, purpose: str) -> Tensor:
-        """(M,) for the cells `rows` (M,)."""
-        if self.parts[0][0] is None:
-            return self._part(self.parts[0][1], state, rows, purpose)
-        kind = state.fields["cell_type"].index_select(0, rows)
-        if self.others is not None:
-            kind = torch.where(torch.isin(kind, kind.new_tensor(self.types)), kind, self.others)
-        known = torch.zeros_like(kind, dtype=torch.bool)
-        out = torch.zeros(rows.numel(), dtype=state.dtype, device=state.device)
-        for number, part in self.parts:
-            mine = torch.eq(kind, int(number or 0))
-            known = known | mine
-            out = torch.where(mine, self._part(part, state, rows, purpose), out)
-        if not bool(known.all()):
-            raise _missing_type(self.name, int(kind[~known][0]), self.types)
-        return out
-
-    @property
-    def types(self) -> tuple[int, ...]:
-        """The cell types that it has values for; none if it is the same for all."""
-        return tuple(n for n, _ in self.parts if n is not None)
-
-    def check_kind(self, kind: int) -> None:
-        """Raise InputError if rates in cells of this type read it, and it has no value for them."""
-        if self.types and kind not in self.types:
-            raise checks.InputError(
-                f"{self.name} has values for the cell types {', '.join(map(str, self.types))}, but"
-                f" the rates of type {kind} read it. Add {kind}: … to it."
-            )
-
-    @property
-    def requires_grad(self) -> bool:
-        each = (part if isinstance(part, Resolved) else part[1] for _, part in self.parts)
-        return any(x.requires_grad for x in each)
-
-    @staticmethod
-    def _part(part: Any, state: State, rows: Tensor, purpose: str) -> Tensor:
-        if isinstance(part, Resolved):
-            return part.of_rows(state, rows)
-        distribution, values = part
-        return distribution.draw(state, rows, purpose, values)
-
-
-def _missing_type(name: str, kind: int, known: Sequence[Any]) -> checks.InputError:
-    listed = ", ".join(map(str, known))
-    return checks.InputError(
-        f"{name} has values for the cell types {listed}, but a cell has type {kind}. Add {kind}: …"
-        " to it."
-    )
-
-
 class Values:
     """The resolved values of one effect by name: `values.rate.of_cells(state)`. A value that was
     not given is None."""
@@ -255,17 +204,24 @@ class Values:
 
 
 def resolve(
-    name: str, value: Any, batch: BoundBatch, *, field: str | None = None, typed: bool = True
+    name: str,
+    value: Any,
+    batch: BoundBatch,
+    *,
+    field: str | None = None,
+    kept: str | None = None,
+    typed: bool = True,
 ) -> Resolved | None:
     """A checked value, made ready for a batch. field: where a value drawn at birth is kept; None:
-    the caller draws. typed: whether the value may also be one per cell type, so that a list of as
-    many numbers can be meant as either."""
+    the caller draws, and keeps it in `kept`, if anywhere. typed: whether the value may also be one
+    per cell type, so that a list of as many numbers can be meant as either."""
     if value is None:
         return None
     if isinstance(value, Schedule):
         return _scheduled(name, value, batch, typed)
     if is_drawn(value):
-        return Resolved(name, draw=_bound_draw(name, value, batch), field=field)
+        check_inherited(name, value, kept is not None)
+        return Resolved(name, draw=_bound_draw(name, value, batch), field=field, kept=kept)
     if isinstance(value, ByType):
         kinds = sorted(value.values)
         each = [_per_colony(f"{name}[{k}]", value.values[k], batch, listed=False) for k in kinds]
@@ -321,9 +277,11 @@ def _bound_draw(name: str, value: Any, batch: BoundBatch) -> BoundDraw:
 
 
 def _distribution(name: str, value: Distribution, batch: BoundBatch) -> tuple[Distribution, Values]:
-    return value, Values(
-        {p: resolve(f"{name}.{p}", getattr(value, p), batch, typed=False) for p in value.parameters}
-    )
+    shared = () if isinstance(value.inherited, bool) else ("inherited",)
+    return value, Values({
+        p: resolve(f"{name}.{p}", getattr(value, p), batch, typed=False)
+        for p in (*value.parameters, *shared)
+    })  # fmt: skip
 
 
 def _per_colony(name: str, value: Any, batch: BoundBatch, listed: bool = True) -> Tensor:

@@ -160,7 +160,7 @@ def checked(name: str, given: object, rule: Rule, forms: str = FORMS) -> Any:
             }
         )
         drawn = [v for v in by_type.values.values() if isinstance(v, Distribution)]
-        if len({v.inherited for v in drawn}) > 1:
+        if len({v.inherited is True for v in drawn}) > 1:
             raise checks.input_error(
                 name,
                 by_type,
@@ -242,7 +242,19 @@ def is_inherited(value: Any) -> bool:
         if isinstance(value, Distribution)
         else [v for v in value.values.values() if isinstance(v, Distribution)]
     )
-    return all(d.inherited for d in drawn)
+    return all(d.inherited is True for d in drawn)
+
+
+def check_inherited(name: str, value: Any, kept: bool) -> None:
+    """Raise InputError for a drawn value of which daughters are to inherit a share, but that no
+    cell keeps."""
+    if kept:
+        return
+    parts = value.values.values() if isinstance(value, ByType) else [value]
+    for part in parts:
+        if isinstance(part, Distribution) and not isinstance(part.inherited, bool):
+            rule = "left out, since no cell keeps this value: it is drawn when it is needed"
+            raise checks.input_error(f"{name}.inherited", part.inherited, rule)
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,16 +262,27 @@ class Distribution(metaclass=checks.KnownKeywords):
     """A random value, drawn once for each cell at its birth. Subclasses: Uniform, Normal,
     LogNormal.
 
-    inherited: daughters keep their parent's value instead of drawing their own.
+    inherited: True: daughters keep their parent's value instead of drawing their own. Of a Normal
+    or LogNormal also a number from 0 to 1, or one per colony: the correlation between parent and
+    daughter. Of what the parent has more than the mean (of the logarithm), daughters have this
+    share, and the rest is drawn, so that all cells have the same distribution; sisters share its
+    square.
     """
 
     parameters: ClassVar[tuple[str, ...]] = ()
     reach: ClassVar[str] = ""  # how far it reaches, for messages, where that is not what was given
-    inherited: bool = dataclasses.field(default=False, kw_only=True)
+    inherited: bool | checks.Value = dataclasses.field(default=False, kw_only=True)
 
     def draw(self, state: State, rows: Tensor, purpose: str, values: Values) -> Tensor:
         """One value for each of the cells `rows` (M,) -> (M,); values: its own parameters,
         resolved."""
+        raise NotImplementedError
+
+    def draw_after(
+        self, parents: Tensor, state: State, rows: Tensor, purpose: str, values: Values
+    ) -> Tensor:
+        """As `draw`, of daughters `rows` (M,) whose parents have these values, (M,), where
+        `inherited` is a number."""
         raise NotImplementedError
 
     def least(self) -> float:
@@ -272,9 +295,11 @@ class Distribution(metaclass=checks.KnownKeywords):
 
     def _check(self, **rules: Rule) -> None:
         if not isinstance(self.inherited, bool):
-            raise checks.input_error(
-                f"{type(self).__name__}.inherited", self.inherited, "True or False"
-            )
+            name = f"{type(self).__name__}.inherited"
+            if type(self).draw_after is Distribution.draw_after:
+                hint = "A Normal or a LogNormal may also have the share that daughters inherit."
+                raise checks.input_error(name, self.inherited, "True or False", hint)
+            rules = {**rules, "inherited": Rule(scope=COLONY, least=0.0, most=1.0)}
         for name, rule in rules.items():
             made = checked(f"{type(self).__name__}.{name}", getattr(self, name), rule)
             object.__setattr__(self, name, made)
