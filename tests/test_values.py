@@ -287,5 +287,9 @@ def test_values_in_a_transform_of_torch_func_are_refused(transform):
 
 @pytest.mark.parametrize("bad", [0.5, "no", 1, None])
 def test_inherited_is_true_or_false(bad):
-    with pytest.raises(tf.InputError, match=r"Normal\.inherited = .* True or False"):
+    with pytest.raises(tf.InputError, match=r"Uniform\.inherited = .* True or False"):
+        tf.Uniform(1.0, 1.1, inherited=bad)
+    if isinstance(bad, (int, float)):
+        return  # the share of a Normal
+    with pytest.raises(tf.InputError, match=r"Normal\.inherited"):
         tf.Normal(1.0, 0.1, inherited=bad)

@@ -83,15 +83,17 @@ class BoundDraw:
 
 
 def of_parents(state: State, rows: Tensor, name: str) -> Tensor | None:
-    """What the parents of the cells `rows` (M,) had in a field, where these are the daughters of
-    the last divisions, first daughters first; None where they are others."""
+    """What the parents of the cells `rows` (M,) had in a field, or their length, where these are
+    the daughters of the last divisions, first daughters first; None where they are others, or
+    where there is no such field."""
     if not state.births:
         return None
     births = state.births[-1]
     daughters = torch.cat([births.first, births.second])
     if rows.shape != daughters.shape or not torch.equal(rows, daughters):
         return None
-    return births.before.fields[name].index_select(0, births.rows).repeat(2)
+    before = births.before.length if name == "length" else births.before.fields.get(name)
+    return None if before is None else before.index_select(0, births.rows).repeat(2)
 
 
 def missing_type(name: str, kind: int, known: Sequence[Any]) -> checks.InputError:

@@ -186,3 +186,37 @@ def test_thresholds_by_cell_type_are_inherited():
         scene = tf.Scene(tf.Growth(rate=1.0), division, founders=founders, dt=0.05)
         *_, state = tf.simulate(scene, until=3.0, seed=1)
         assert state.cells >= 16 and state.division_threshold.unique().numel() == 2
+
+
+@pytest.mark.parametrize("conserves", ["length", "volume"])
+def test_what_grows_after_a_threshold_counts_as_added_by_the_daughters(conserves):
+    """They begin to count at the length that they would have had, had the step ended in time."""
+    division = tf.Division(added=1.0, fraction=0.375, conserves=conserves)
+    growth = tf.Growth(rate=1.0, law="linear")
+    founders = tf.Cells.single(2, length=2.0)
+    scene = tf.Scene(growth, division, founders=founders, dt=0.3)
+    model = scene.bind(dtype=torch.float64)
+    state = model.start()
+    for _ in range(4):
+        state = model.step(state)
+    caps = 1.0 if conserves == "length" else 2.0 / 3.0
+    born = lambda length: [share * (length + caps) - caps for share in (0.375, 0.625)]
+    assert state.length.tolist() == pytest.approx(born(3.2))
+    assert state.birth_length.tolist() == pytest.approx(born(3.0))
+
+
+def test_no_more_counts_than_the_step_has_grown():
+    """As where a rule gives a cell a type whose threshold it has passed long ago."""
+
+    def rise(cells):
+        cells.cell_type = torch.where(cells.length > 4.0, 1, 0)
+
+    founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 2.0, cell_type=[0])
+    scene = tf.Scene(
+        tf.Rules(rise), tf.Growth(rate=1.0, law="linear"), tf.Division(added={0: 9.0, 1: 0.5}),
+        founders=founders, dt=0.3,
+    )  # fmt: skip
+    *_, state = tf.simulate(scene, until=2.4)
+    assert state.cells == 2  # 4.1 µm, and one step later 4.4, of which 0.3 count
+    assert state.length.tolist() == pytest.approx([1.7] * 2, rel=1e-5)
+    assert state.birth_length.tolist() == pytest.approx([1.7 - 0.15] * 2, rel=1e-5)

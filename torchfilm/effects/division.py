@@ -20,7 +20,13 @@ from torchfilm.effects.compiled_division import (
     known_number,
     knows_due,
 )
-from torchfilm.effects.division_lengths import CAPS, least_length, smaller_shares, without_short
+from torchfilm.effects.division_lengths import (
+    CAPS,
+    least_length,
+    length_at_birth,
+    smaller_shares,
+    without_short,
+)
 from torchfilm.physics import capsule
 from torchfilm.resolver import Resolved, Values
 from torchfilm.state import CELL, Births, Field, State
@@ -117,7 +123,7 @@ class Division(Effect):
                     "birth_length",
                     "centreline length at birth",
                     "µm",
-                    initial=_length_of_rows,
+                    initial=length_at_birth,
                     at_division="reset",
                 )
             )
@@ -410,10 +416,6 @@ def _new_ids(new: State, daughters: Tensor, parents: Tensor) -> tuple[Tensor, Te
     parent = new.parent.clone()
     parent[daughters] = torch.cat([parents, parents])
     return uid, parent, new.next_uid + per_colony
-
-
-def _length_of_rows(state: State, rows: Tensor, values: Values) -> Tensor:
-    return state.length.index_select(0, rows)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Which cells are too short to divide, and how that is reported."""
+"""Lengths at division: which cells are too short to divide, and how long daughters are at birth."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from torchfilm.resolver import Resolved
+from torchfilm.bound_draw import of_parents
+from torchfilm.resolver import Resolved, Values
 from torchfilm.state import State
 from torchfilm.values import ByType, is_drawn, largest, smallest
 
@@ -86,3 +87,20 @@ def without_short(state: State, rows: Tensor, need: Any) -> tuple[State, Tensor 
     report = DivisionReport(status, pick(state.uid), pick(state.length), pick(lengths))
     sound = (status != TOO_SHORT).index_select(0, state.colony.index_select(0, rows))
     return state.replace(reports={**state.reports, "division": report}), sound
+
+
+def length_at_birth(state: State, rows: Tensor, values: Values) -> Tensor:
+    """The length from which cells count what they add. A step ends after a parent has reached its
+    threshold: what its daughters have grown since then counts as added."""
+    length = state.length.index_select(0, rows)
+    parent, begin, threshold, grown = (
+        of_parents(state, rows, n)
+        for n in ("length", "birth_length", "division_threshold", "elongation")
+    )
+    if parent is None or begin is None or threshold is None:
+        return length
+    late = (parent - begin - threshold).clamp(min=0.0)  # 0 of cells that a rule has flagged
+    late = late if grown is None else torch.minimum(late, grown.clamp(min=0.0))
+    # with c, the length that makes caps, a daughter of the share f is f·(parent + c) − c long
+    caps = parent - length.view(2, -1).sum(0).repeat(2)
+    return length - (length + caps) / (parent + caps) * late
