@@ -279,10 +279,12 @@ def _below_failed(
     """Losses (n,) of some rows (n,) of finished colonies that a search can compare, NaN for the
     others, and why, by their places: a colony that grew must not look worse than one that
     failed."""
-    why = {}
+    why, undefined = {}, np.flatnonzero(~np.isfinite(score)).tolist()
+    words = _undefined(target, event, [int(rows[k]) for k in undefined])
+    missing = dict(zip(undefined, words, strict=True))
     for k, number in enumerate(score.tolist()):
         if not math.isfinite(number):
-            why[k] = f"the target's loss was {number}{_undefined(target, event, int(rows[k]))}"
+            why[k] = f"the target's loss was {number}{missing[k]}"
         elif number > target.failed:
             why[k] = (
                 f"the target's loss was {number:g}, above {target.failed:g}, that of a failed"
@@ -291,14 +293,21 @@ def _below_failed(
     return np.where([k in why for k in range(len(score))], np.nan, score), why
 
 
-def _undefined(target: Target, event: FinishedColonies, row: int) -> str:
-    """The first measure of a colony that data are compared with and that is not a number."""
+def _undefined(target: Target, event: FinishedColonies, rows: list[int]) -> list[str]:
+    """Of each of these colonies the first measure that data are compared with and that is not a
+    number."""
     known = target.evidence
-    for name, found in target.measures(event.state, event.history).items() if known else ():
-        if name in known and found[row].isnan() and target.concerns(name, event.state)[row]:
-            reason = target.why_undefined(name)
-            return f": {name} was not a number{f', as {reason}' if reason else ''}"
-    return ""
+    if not rows or not known:
+        return [""] * len(rows)
+    found = target.measures(event.state, event.history)
+    each = [(n, found[n].isnan() & target.concerns(n, event.state)) for n in found if n in known]
+    out = []
+    for row in rows:
+        name = next((name for name, missing in each if missing[row]), None)
+        reason = "" if name is None else target.why_undefined(name)
+        as_ = f", as {reason}" if reason else ""
+        out.append("" if name is None else f": {name} was not a number{as_}")
+    return out
 
 
 def _unfit(task: Task, state: tf.State, size: float) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import pytest
 import torch
 
@@ -12,8 +14,10 @@ from torchfilm.tools.checks import InputError
 
 @pytest.fixture(scope="module")
 def state():
-    """Two colonies of touching cells, and an empty one between them."""
-    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics(dim=2), dt=0.05)
+    """Two colonies of touching cells, one larger than the other, and an empty one between them."""
+    scene = tf.Scene(
+        tf.Growth(rate=[1.0, 1.0, 0.8]), tf.Division(length=3.5), tf.Mechanics(dim=2), dt=0.05
+    )
     *_, grown = tf.simulate(scene, until=4.0, colonies=3, seed=3)
     return grown.remove(grown.colony == 1, "removed")
 
@@ -128,3 +132,90 @@ def test_constants_are_read_in_branches_helpers_and_by_their_texts():
         (late, None), (by_text, None), (through_another, None), (None, divide), (Callable(), None)
     ):  # fmt: skip
         scene(update, at_division, kill=3.0).bind()  # without a warning
+
+
+class Reader:
+    """Reads constants where no code tells it."""
+
+    def kill(self, cells):
+        return cells.p.kill
+
+
+READER, NAMES = Reader(), ("kill",)
+
+
+def test_no_alarm_where_nobody_can_tell():
+    def by_method(cells):
+        cells.seen = READER.kill(cells) + 0.0 * cells.length
+
+    def by_names(cells):
+        for name in NAMES:
+            cells.seen = cells.p[name] + 0.0 * cells.length
+
+    def by_getattr(cells):
+        cells.seen = getattr(cells.p, f"k{'ill'}") + 0.0 * cells.length
+
+    def as_one(cells):
+        constants = cells.p
+        cells.seen = constants["ki" + "ll"[:2]] + 0.0 * cells.length
+
+    def over_all(cells):
+        cells.seen = sum(cells.p[n] for n in cells.p) + 0.0 * cells.length
+
+    def nested(cells):
+        def inner():
+            return cells.p.kill
+
+        cells.seen = inner() + 0.0 * cells.length
+
+    inside = lambda cells: cells.p.kill
+
+    def closed_over(cells):
+        cells.seen = inside(cells) + 0.0 * cells.length
+
+    def by_default(cells, read=helped):
+        cells.seen = read(cells) + 0.0 * cells.length
+
+    for update in (by_method, by_names, by_getattr, as_one, over_all, nested, closed_over,
+                   by_default, functools.partial(by_method)):  # fmt: skip
+        scene(update, kill=3.0).bind()  # without a warning
+
+
+def test_places_can_only_be_read():
+    def push(cells):
+        cells.x = cells.x + 1.0
+
+    def push_one(cells):
+        for cell in cells:
+            cell.y = 1.0
+
+    for update in (push, push_one):
+        with pytest.raises(InputError, match=r"cells\.[xy] can only be read"):
+            scene(update).bind()
+    own = tf.Rules(push, variables={"x": 2.0})  # a variable of one's own
+    base = scene(None, lambda parent, one, other: setattr(one, "seen", parent.x))
+    state = tf.Scene(own, tf.Growth(rate=1.0), dim=2, dt=0.05).bind().start()
+    assert float(state.x[0]) == 2.0
+    *_, state = tf.simulate(base, until=1.5)
+    assert state.cells > 1
+
+
+def test_what_rules_ask_of_neighbours_is_read():
+    """So that rules that move or resize cells come before."""
+
+    def count(cells):
+        cells.seen = cells.contact_sum(cells.colony > -1)
+
+    def deep(cells):
+        cells.seen = cells.below_top(across={"x": (-9.0, 9.0)})
+
+    for update in (count, deep):
+        model = scene(update).bind()
+        (rules,) = (e for e in model.effects if e.title == "rules")
+        assert {"position", "axis", "length", "radius"} <= set(rules.reads())
+
+
+def test_distances_are_finite(state):
+    for within in (-1.0, float("inf"), float("nan"), "near"):
+        with pytest.raises(InputError, match=r"contacts\(within\)"):
+            seen(state).contacts(within)

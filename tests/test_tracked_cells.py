@@ -166,6 +166,34 @@ def test_a_cell_and_its_only_daughter_are_one_where_joined():
         tf.Lineage.from_table(table(rows), join="all")
 
 
+def test_a_cell_that_has_divided_is_not_joined_with_its_only_daughter():
+    rows = [(1, 0, 0, 2.0), (1, 0, 10, 3.0), (2, 1, 20, 1.4), (3, 2, 30, 1.6), (3, 2, 40, 2.0)]
+    with pytest.warns(UserWarning, match=r"1 cells have one daughter \(such as 1\)") as found:
+        tree = tf.Lineage.from_table(table(rows), join=True)
+    assert tree.cell.tolist() == [1, 2] and tree.end_length.tolist()[0] == 3.0
+    assert "join=True" not in str(found[0].message)
+
+
+def test_tracks_that_go_on_through_divisions_are_told():
+    rows = [(1, 0, 10 * k, 2.0 + k % 3) for k in range(9)]
+    with pytest.warns(
+        UserWarning, match=r"1 cells get shorter .* \(such as 1\): have they divided"
+    ):
+        tf.Lineage.from_table(table(rows))
+
+
+def test_movies_of_other_intervals_are_told():
+    rows = [(1, 0, 10 * k, 2.0) for k in range(5)] + [(1, 0, 2 * k, 2.0) for k in range(5)]
+    with pytest.warns(UserWarning, match=r"colony 1 are 0\.0333 h apart, those of colony 0 0\.167"):
+        tf.Lineage.from_table(table(rows, colony=[0] * 5 + [1] * 5))
+
+
+def test_seconds_are_read():
+    rows = table()
+    rows["time_s"] = [60.0 * t for t in rows.pop("time_min")]
+    assert tf.Lineage.from_table(rows).now == pytest.approx(5 / 6)
+
+
 def test_a_file_of_tracks(tmp_path):
     path = tmp_path / "man_track.txt"
     path.write_text("1 0 1 0\n2 2 3 1\n3 2 3 1\n4 4 5 2\n5 4 5 2\n", encoding="utf-8")

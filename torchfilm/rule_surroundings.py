@@ -12,6 +12,7 @@ from torchfilm.physics.nearby import pairs_within
 from torchfilm.rule_values import real_column
 from torchfilm.state import State
 from torchfilm.tools import checks
+from torchfilm.tools.ragged import Groups
 
 
 class Surroundings:
@@ -49,8 +50,7 @@ class Surroundings:
         Each pair occurs once, in either order: what goes from cell to cell both ways needs both
         (i, j) and (j, i), as in `contact_sum`. The search runs only when a rule calls this.
         """
-        if not (isinstance(within, (int, float)) and within >= 0):
-            raise checks.input_error("contacts(within)", within, "a distance in µm, 0 or more")
+        checks.number("contacts(within)", within, least=0.0)
         self._read.update(("position", "axis", "length", "radius"))
         s = self._state
         shape = s.position, s.axis, s.length, s.radius
@@ -62,8 +62,8 @@ class Surroundings:
         `contacts`. Gradients pass through the value."""
         value = real_column("contact_sum", value, self._state)
         i, j = self.contacts(within)
-        found = torch.zeros_like(value).index_add(0, i, value.index_select(0, j))
-        return found.index_add(0, j, value.index_select(0, i))
+        given = torch.cat([value.index_select(0, j), value.index_select(0, i)])
+        return Groups(torch.cat([i, j]), self._state.cells).sum(given)
 
     def contact_count(self, within: float = 0.05) -> Tensor:
         """The number of cells that each cell touches, (N,) int64."""

@@ -208,6 +208,7 @@ class CellsView(Draws, Surroundings):
         if (
             of_colony
             or name in (*GEOMETRY, *IDENTITY, "signals")
+            or (name in AXES[: state.dim] and name not in state.fields)
             or isinstance(getattr(type(self), name, None), property)
         ):
             raise RuleError(
@@ -335,6 +336,8 @@ class DivisionView(Draws):
         if name == "p" and self._constants is not None:
             return self._constants()
         if name not in self._work:
+            if name in AXES[: self._state.dim] and name not in self._state.fields:
+                return self.position[:, AXES.index(name)]
             if not (name in GEOMETRY or name in IDENTITY or name in self._state.fields):
                 known = _known_names(self._state)
                 raise RuleError(

@@ -44,6 +44,8 @@ class Target(metaclass=checks.KnownKeywords):
     pattern: ClassVar[bool] = True
     # whether each of its residuals is the same number of every colony, such as a mean
     comparable: ClassVar[bool] = False
+    # whether the columns that it notes differ in number from step to step
+    ragged: ClassVar[bool] = False
     # whether it asks how many cells are lit, and not which
     anywhere: ClassVar[bool] = False
 
@@ -92,8 +94,8 @@ class Target(metaclass=checks.KnownKeywords):
         return [""] * state.colonies
 
     def note(self, state: tf.State) -> Tensor | None:
-        """What a target that needs the history keeps of a state after every step, (B, k); None:
-        nothing."""
+        """What a target that needs the history keeps of a state after every step, (B, k), where k
+        is the same at every step, unless the target is `ragged`; None: nothing."""
         return None
 
     def course(self, state: tf.State) -> Tensor | None:

@@ -18,6 +18,7 @@ EVENT = 7  # numbers of a division in a note, after the time
 BITS = 40  # of a uid, beside the place of its colony
 CAPS = 4.0 / 3.0  # the caps of a rod have the volume of a length of so many radii
 STEADY = 1e-9  # relative variation that rounding can cause
+ROUNDING = 1e-6  # of an interval, by which the time of a step may be off
 DRAWN = 200  # colonies whose cycles are drawn again
 
 GROUPS = {
@@ -30,21 +31,23 @@ GROUPS = {
     "mothers": ("generation_time_mothers",),
     "lengths of mothers": ("birth_length_mothers", "growth_mothers"),
 }
-OF_LENGTHS = ("birth length", "division length", "added length", "growth", "lengths of mothers")
-OF_MOTHERS = ("mothers", "lengths of mothers")
+OF_LENGTHS = ("birth length", "division length", "added length", "growth")
 
 
 @dataclass(frozen=True)
 class CycleStatistics:
     """Which statistics of cell cycles are compared.
 
-    lengths: whether the lengths of cells are known. sisters, mothers: whether cells are compared
-    with theirs. omitted: groups that are left out.
+    lengths: whether the lengths of cells are known. sisters, mothers, mothers_lengths: whether
+    cells are compared with theirs. interval: h between frames, in which simulated cells are seen,
+    too. omitted: groups that are left out.
     """
 
     lengths: bool
     sisters: bool
     mothers: bool
+    mothers_lengths: bool
+    interval: float = 0.0
     omitted: tuple[str, ...] = ()
     species: ClassVar[tuple[str, ...]] = ()
     ages: ClassVar[bool] = False
@@ -57,7 +60,8 @@ class CycleStatistics:
             *self.omitted,
             *(() if self.lengths else OF_LENGTHS),
             *(() if self.sisters else ("sisters",)),
-            *(() if self.mothers else OF_MOTHERS),
+            *(() if self.mothers else ("mothers",)),
+            *(() if self.mothers_lengths else ("lengths of mothers",)),
         }
         return {group: names for group, names in GROUPS.items() if group not in left_out}
 
@@ -72,6 +76,11 @@ class CycleStatistics:
         each = cycles.tables(colonies)
         nothing = [np.nan] * len(self.names)
         return np.array([self.of_rows(own) if len(own) >= FEWEST else nothing for own in each])
+
+    @property
+    def kinds(self) -> dict[str, tuple[str, ...]]:
+        """Each statistic as a group of its own: they differ in their units."""
+        return {name: (name,) for name in self.names}
 
     def of_rows(self, rows: np.ndarray) -> list[float]:
         """The statistics of the cycles of one colony, (K,), from rows of `CellCycles.table`."""
@@ -124,34 +133,36 @@ class CellCycles:
 
     @staticmethod
     def of_lineage(lineage: tf.Lineage, radius: float) -> CellCycles:
-        """Those of tracked cells, or of a run. Between frames cells are not seen: they are born and
-        divide half an interval, on average, before they are seen to, and grow until then as they do
-        between their own frames."""
-        born = (lineage.parent >= 0) & np.isfinite(lineage.born)
-        rows = np.flatnonzero(born & (lineage.fate == "divided"))
+        """Those of tracked cells, or of a run. A cell is born when her mother divides, which may be
+        before it is seen. Between frames cells are not seen: they are born and divide half an
+        interval, on average, before they are seen to, and grow until then as they do between their
+        own first and last frame."""
+        mothers, sisters = lineage.pairs("mother").T, lineage.pairs("sister").T
+        begin = np.full(len(lineage), np.nan)
+        begin[mothers[1]] = lineage.ended[mothers[0]]
+        rows = np.flatnonzero(np.isfinite(begin) & (lineage.fate == "divided"))
         colony = np.unique(lineage.colony, return_inverse=True)[1][rows]
         order = np.argsort(colony, kind="stable")
-        rows, colony = rows[order], colony[order]
-        time = lineage.ended[rows] - lineage.born[rows]
+        rows, colony, begin = rows[order], colony[order], begin[rows[order]]
+        end, first, last = lineage.ended[rows], lineage.first_seen[rows], lineage.last_seen[rows]
         birth, division = lineage.birth_length[rows], lineage.end_length[rows]
         if lineage.interval:
-            seen = time - lineage.interval  # from its first frame to its last
-            seen = np.where(seen > 1e-9, seen, np.nan)
-            caps = CAPS * radius
-            unseen = ((division + caps) / (birth + caps)) ** (0.5 * lineage.interval / seen)
-            birth, division = (birth + caps) / unseen - caps, (division + caps) * unseen - caps
-        place = np.full(len(lineage), -1)
+            caps, half = CAPS * radius, 0.5 * lineage.interval
+            seen = np.where(last - first > 1e-9, last - first, np.nan)
+            rate = np.log((division + caps) / (birth + caps)) / seen
+            birth = (birth + caps) * np.exp(-rate * (first - begin + half)) - caps
+            division = (division + caps) * np.exp(rate * (end - half - last)) - caps
+        place, mother, sister = np.full((3, len(lineage)), -1)
         place[rows] = np.arange(len(rows))
-        mother, sister = np.full((2, len(lineage)), -1)
-        of_mothers, of_sisters = lineage.pairs("mother").T, lineage.pairs("sister").T
-        mother[of_mothers[1]] = place[of_mothers[0]]
-        sister[of_sisters[0]], sister[of_sisters[1]] = place[of_sisters[1]], place[of_sisters[0]]
+        mother[mothers[1]] = place[mothers[0]]
+        sister[sisters[0]], sister[sisters[1]] = place[sisters[1]], place[sisters[0]]
         widths = np.full(len(rows), radius)
-        return CellCycles(colony, mother[rows], sister[rows], time, birth, division, widths)
+        return CellCycles(colony, mother[rows], sister[rows], end - begin, birth, division, widths)
 
     @staticmethod
-    def of_notes(history: Tensor) -> CellCycles:
-        """Those of simulated colonies, from the `division_note`s of all steps, (T, B, 1 + 7M)."""
+    def of_notes(history: Tensor, interval: float = 0.0) -> CellCycles:
+        """Those of simulated colonies, from the `division_note`s of all steps, (T, B, 1 + 7M), as
+        frames show them that are `interval` hours apart, the first as the colony begins."""
         notes = history.detach().cpu().double().numpy().transpose(1, 0, 2)
         events = notes[:, :, 1:].reshape(*notes.shape[:2], -1, EVENT)
         colony, step, _ = there = np.nonzero(events[..., 0] > 0)
@@ -168,10 +179,38 @@ class CellCycles:
         event, length_at_birth = events_of[at], np.concatenate([of[:, 5], of[:, 6]])[at]
         cycle = np.argsort(mother[complete])
         found = lambda keys: _taken(cycle, _places(mother[complete][cycle], keys))
-        return CellCycles(
-            colony[complete], found(mother[event]), found(other[at]), time[complete] - time[event],
-            length_at_birth, length[complete], of[complete, 2],
-        )  # fmt: skip
+        ends = _seen(
+            time[event],
+            time[complete],
+            length_at_birth,
+            length[complete],
+            of[complete, 2],
+            interval,
+        )
+        sisters = found(other[at])
+        return CellCycles(colony[complete], found(mother[event]), sisters, *ends, of[complete, 2])
+
+
+def _seen(
+    begin: np.ndarray, end: np.ndarray, birth: np.ndarray, division: np.ndarray,
+    radius: np.ndarray, interval: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """How long cycles take, and lengths at birth and division, as frames show them and `of_lineage`
+    takes them. NaN of what no frame shows: of a cell that is in one frame no growth, and so no
+    length, of one that is in none nothing."""
+    if not interval:
+        return end - begin, birth, division
+    # h until the next frame
+    late = lambda time: np.ceil(time / interval - ROUNDING) * interval - time
+    caps, half = CAPS * radius, 0.5 * interval
+    span = np.where(end > begin, end - begin, np.nan)
+    rate = np.log((division + caps) / (birth + caps)) / span
+    time = end + late(end) - begin - late(begin)
+    frames = np.round(time / interval)
+    moved = lambda length, by: (length + caps) * np.exp(rate * by) - caps
+    lengths = (moved(birth, late(begin) - half), moved(division, late(end) - half))
+    birth, division = (np.where(frames > 1, x, np.nan) for x in lengths)
+    return np.where(frames > 0, time, np.nan), birth, division
 
 
 def _places(ordered: np.ndarray, keys: np.ndarray) -> np.ndarray:

@@ -78,6 +78,9 @@ class ObservedConditions(Observed):
         mine = self.conditions.condition_of(state).unsqueeze(1)
         return torch.cat([x.where(mine == k, torch.nan) for k, x in enumerate(each)], 1)
 
+    def why_undefined(self, measure: str) -> str:
+        return self.conditions.why_undefined(measure)
+
     def describe(self) -> str:
         many = f"{self.colonies} observed colon" + ("ies" if self.colonies > 1 else "y")
         when = "" if self.time is None else f" at {self.time:g} h"

@@ -31,7 +31,7 @@ from torchfilm import checks, tables
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-NOTES, OF_A_FRAME = 2, ColonyStatistics | MeasureStatistics  # columns of a birth note; plans
+NOTES = 2  # columns of a birth note
 
 
 class JoinedStatistics(ABC):
@@ -366,6 +366,9 @@ def ending_at(data: Observed, end: float) -> Observed:
     """The same data of colonies that go on until `end` h."""
     if data.time in (None, end):
         return data
+    if data.ragged:
+        rule = f"{end:g} h, as of the others: cells are followed until the end"
+        raise checks.input_error(f"time of {type(data).__name__}", data.time, rule)
     return _course(data.frames if isinstance(data, ObservedCourse) else (data,), end)
 
 
@@ -390,9 +393,10 @@ def _checked(frames: object) -> tuple[Observed, ...]:
     rule = "two or more Observed(…, time=…), in the order of their times"
     if not isinstance(frames, Sequence) or len(frames) < 2:
         raise checks.input_error("ObservedCourse.frames", frames, rule)
+    names = lambda frame: {_plain(name) for name in frame.plan.names}  # as tables have them
     found: list[Observed] = []
     for k, frame in enumerate(map(as_data, frames)):
-        if not (isinstance(frame, Observed) and isinstance(frame.plan, OF_A_FRAME)):
+        if not isinstance(frame, Observed) or isinstance(frame, ObservedCourse) or frame.ragged:
             rule = "an Observed or a Measured"
             raise checks.input_error(f"ObservedCourse.frames[{k}]", frame, rule)
         if frame.time is None:
@@ -408,13 +412,8 @@ def _checked(frames: object) -> tuple[Observed, ...]:
                 f"above that of the frame before, {found[-1].time:g} h",
                 "An Observed and a Measured may have one time.",
             )  # fmt: skip
-        if beside and (both := {*_measures(frame)} & {*_measures(there[0])}):
+        if beside and (both := names(frame) & names(there[0])):
             rule = f"of other names than the Observed of {frame.time:g} h"
             raise checks.input_error(f"ObservedCourse.frames[{k}]", sorted(both), rule)
         found.append(frame)
     return tuple(found)
-
-
-def _measures(frame: Observed) -> list[str]:
-    """The names of what a frame compares, as tables have them."""
-    return [_plain(name) for name in frame.plan.names]

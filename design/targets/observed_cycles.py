@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +17,9 @@ from design.targets.observed import Observed
 from design.targets.observed_values import spread_of, warn_of_width
 from torchfilm import checks
 
+SHORTER = 0.95  # of the time of another movie, that is not as long
+OTHER = 1.05  # times the interval of another movie, that is another one
+VARIED = 0.002  # the least spread of a coefficient of variation
 RELATED = 10  # complete cycles of a colony with complete mothers, to compare the two
 
 
@@ -37,17 +41,19 @@ class ObservedCycles(Observed):
     statistics are those of generation times.
 
     A simulated colony grows for as long as the movie lasts, so that long cycles are missed in both
-    alike. It should begin as the movie does: give the scene such founders, whose own cycles do not
-    count. Between frames cells are born and divide unseen, half an interval before the next frame,
-    on average: lengths at birth and division are carried to there by the cell's own growth.
-    The loss, and spreads, are those of `Observed`: cycles are drawn again with replacement, as if
-    they were independent.
+    alike, and is seen in frames as far apart: between them cells are born and divide half an
+    interval before the next one, on average, and lengths at birth and division are carried to
+    there by the cell's own growth, which makes them vary more. It should begin as the movie does:
+    give the scene such founders, whose own cycles do not count. The loss, and spreads, are those
+    of `Observed`: cycles are drawn again with replacement, as if they were independent.
 
-    lineages: of movies that last as long as each other, or of runs. radius: of the cells, µm, for
-    their volumes. like: another `ObservedCycles`, whose statistics are taken. Raises InputError for
-    a colony with fewer than 3 complete cycles. A simulated one has failed.
+    lineages: of movies with the same interval and length, or of runs. radius: of the cells, µm, for
+    their volumes. time: h, how long the movies last, by default from their first frame to the
+    last. like: another `ObservedCycles`, whose statistics are taken. Raises InputError for a colony
+    with fewer than 3 complete cycles. A simulated one has failed.
     """
 
+    ragged = True
     plan: CycleStatistics  # type: ignore[assignment]
     cycles: int = field(default=0, repr=False, compare=False)
 
@@ -56,6 +62,7 @@ class ObservedCycles(Observed):
         lineages: tf.Lineage | Sequence[tf.Lineage],
         *,
         radius: float = 0.5,
+        time: float | None = None,
         like: ObservedCycles | None = None,
     ):
         given = _checked(lineages)
@@ -63,7 +70,8 @@ class ObservedCycles(Observed):
             raise checks.input_error("ObservedCycles(like)", like, "an ObservedCycles, or None")
         checks.number("ObservedCycles(radius)", radius, above=0.0)
         each = [own for lineage in given for own in _tables(lineage, radius)]
-        plan = _plan(each) if like is None else like.plan
+        interval = _interval(given)
+        plan = _plan(each, interval) if like is None else replace(like.plan, interval=interval)
         values = np.array([plan.of_rows(own) for own in each])
         _check_known(plan, values)
         drawn = np.array([plan.resampled_spread(own) for own in each])
@@ -71,15 +79,27 @@ class ObservedCycles(Observed):
         found = {
             "plan": plan,
             "values": tuple(values.mean(0).tolist()),
-            "spread": tuple(spread_of(torch.tensor(values), root, plan.groups).tolist()),
+            "spread": tuple(
+                spread_of(torch.tensor(values), root, plan.kinds, varied=VARIED).tolist()
+            ),
             "colonies": len(each),
-            "cells": 0,
-            "time": _length(given),
+            "cells": sum(int((of.fate == "alive").sum()) for of in given),
+            "time": _length(given) if time is None else checks.number("time", time, above=0.0),
             "width": 2.0 * radius,
             "cycles": sum(map(len, each)),
         }
         for name, value in found.items():
             object.__setattr__(self, name, value)
+
+    @staticmethod
+    def from_table(*given: Any, **options: Any) -> ObservedCycles:
+        """Raises InputError: cell cycles are those of a `tf.Lineage`."""
+        raise tf.InputError(
+            "ObservedCycles are made of a lineage: ObservedCycles(tf.Lineage.from_table(…)), or"
+            " ObservedCycles(results.lineage())."
+        )
+
+    from_masks = from_state = from_results = from_table
 
     def without(self, *groups: str) -> ObservedCycles:
         """The same data without some groups of statistics, such as "sisters"; `table()` lists
@@ -100,6 +120,9 @@ class ObservedCycles(Observed):
     def check(self, state: tf.State) -> None:
         warn_of_width(self.width, state)
 
+    def why_rough(self, state: tf.State) -> str:
+        return "cell cycles have no derivatives by what cells contain"
+
     def note(self, state: tf.State) -> Tensor:
         """The time and the divisions of the last step, (B, 1 + 7M)."""
         return division_note(state)
@@ -112,7 +135,7 @@ class ObservedCycles(Observed):
                 "cell cycles need the notes of all steps: stack target.note(state) after each of"
                 " them."
             )
-        found = self.plan.of(CellCycles.of_notes(history), state.colonies)
+        found = self.plan.of(CellCycles.of_notes(history, self.plan.interval), state.colonies)
         return torch.tensor(found, device=state.device)
 
     def why_undefined(self, measure: str) -> str:
@@ -127,8 +150,8 @@ class ObservedCycles(Observed):
 
 def _checked(lineages: object) -> list[tf.Lineage]:
     given = [lineages] if isinstance(lineages, tf.Lineage) else lineages
-    rule = "a tf.Lineage, or a list of them"
-    if not isinstance(given, Sequence) or not given:
+    rule = "a tf.Lineage, such as tf.Lineage.from_table(…), or a list of them"
+    if not isinstance(given, (list, tuple)) or not given:
         raise checks.input_error("ObservedCycles.lineages", lineages, rule)
     for k, of in enumerate(given):
         if not isinstance(of, tf.Lineage):
@@ -138,10 +161,32 @@ def _checked(lineages: object) -> list[tf.Lineage]:
 
 def _length(lineages: Sequence[tf.Lineage]) -> float:
     """How long their movies last, h."""
-    each = [round(of.now - of.begin, 9) for of in lineages]
-    if max(each) > min(each) * (1 + 1e-6):
-        rule = "of movies that last as long as each other, as long cycles are missed in short ones"
-        raise checks.input_error("ObservedCycles.lineages", [f"{x:g} h" for x in each], rule)
+    spans = {}
+    for k, of in enumerate(lineages):
+        for colony in np.unique(of.colony).tolist():
+            mine = of.colony == colony
+            spans[k, colony] = float(of.last_seen[mine].max() - of.first_seen[mine].min())
+    longest = max(spans.values())
+    short = [(k, c) for (k, c), span in spans.items() if span < SHORTER * longest]
+    if short:
+        place = "" if len(lineages) == 1 else f" of lineages[{short[0][0]}]"
+        raise checks.input_error(
+            "ObservedCycles.lineages",
+            f"colony {short[0][1]}{place}, seen for {spans[short[0]]:.3g} h",
+            f"of colonies that were seen for as long as each other, and the longest is"
+            f" {longest:.3g} h: long cycles are missed in short movies",
+            "Cut the longer ones, leave the shorter out, or say by time=… how long all were"
+            " watched, as where cells were lost.",
+        )
+    return round(longest, 9)
+
+
+def _interval(lineages: Sequence[tf.Lineage]) -> float:
+    """The time between their frames, h."""
+    each = [of.interval for of in lineages]
+    if max(each) > OTHER * min(each):
+        rule = "of movies with the same interval between frames"
+        raise checks.input_error("ObservedCycles.lineages", [f"{x:.3g} h" for x in each], rule)
     return each[0]
 
 
@@ -161,14 +206,24 @@ def _tables(lineage: tf.Lineage, radius: float) -> list[np.ndarray]:
     return each
 
 
-def _plan(each: Sequence[np.ndarray]) -> CycleStatistics:
-    """The statistics that all colonies have."""
+def _plan(each: Sequence[np.ndarray], interval: float) -> CycleStatistics:
+    """The statistics that all colonies have. Warns of relatives that only some have."""
     known = [dict(zip(COLUMNS, np.isfinite(own).sum(0).tolist(), strict=True)) for own in each]
     has = lambda column, least: all(colony[column] >= least for colony in known)
+    for column, who in (("sister time", "sisters"), ("mother time", "mothers and daughters")):
+        found = [colony[column] for colony in known]
+        if min(found) < RELATED <= max(found):
+            checks.warn(
+                f"{who} are not compared: of the {len(found)} colonies, one has {min(found)} with"
+                f" complete cycles, and {RELATED} are needed. Leave such colonies out, if that"
+                " matters."
+            )
     return CycleStatistics(
         lengths=has("growth", FEWEST),
         sisters=has("sister time", RELATED),
         mothers=has("mother time", RELATED),
+        mothers_lengths=has("mother growth", RELATED),
+        interval=interval,
     )
 
 

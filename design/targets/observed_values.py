@@ -33,11 +33,15 @@ def values_of(
 
 
 def spread_of(
-    each: Tensor, drawn: Tensor, groups: Mapping[str, tuple[str, ...]], size: float = 1.0
+    each: Tensor,
+    drawn: Tensor,
+    groups: Mapping[str, tuple[str, ...]],
+    size: float = 1.0,
+    varied: float = VARIED,
 ) -> Tensor:
     """The spread of each statistic, (K,) above 0. each: those of the colonies, (C, K); drawn: the
     spread within a colony, (K,); groups: the names of statistics that are of one kind; size: how
-    many cells a colony has."""
+    many cells a colony has; varied: the least spread of a coefficient of variation."""
     names = [name for kind in groups.values() for name in kind]
     spread = drawn
     if len(each) >= ENOUGH:
@@ -54,7 +58,7 @@ def spread_of(
     ])  # fmt: skip
     if names[0] == LOG_CELLS:
         least[0] = max(COUNT, PART / size)
-    alike = torch.tensor([VARIED if n.endswith("_cv") else 0.0 for n in names])
+    alike = torch.tensor([varied if n.endswith("_cv") else 0.0 for n in names])
     least = torch.maximum(least, alike.to(least))
     spread = torch.maximum(spread, least)
     # a reporter that is dark in all cells

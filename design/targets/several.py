@@ -68,8 +68,16 @@ class Several(Target):
         ]
 
     def note(self, state: tf.State) -> Tensor | None:
-        found = [note for note in (part.note(state) for part in self.parts) if note is not None]
-        return torch.cat(found, 1) if found else None
+        each = [part.note(state) for part in self.parts]
+        found = [note for note in each if note is not None]
+        if not self.ragged:
+            return torch.cat(found, 1) if found else None
+        widths = [0.0 if note is None else float(note.shape[1]) for note in each]
+        return torch.cat([found[0].new_tensor(widths).expand(state.colonies, -1), *found], 1)
+
+    @property
+    def ragged(self) -> bool:  # type: ignore[override]
+        return any(part.ragged for part in self.parts)
 
     def kept(self, state: tf.State) -> float:
         return sum(part.kept(state) for part in self.parts)
@@ -78,6 +86,9 @@ class Several(Target):
         self, of: Callable[[Target, Tensor | None], Any], state: tf.State, history: Tensor | None
     ) -> list[Any]:
         """Something of every part, with its own columns of the history."""
+        if self.ragged and history is not None:
+            each = zip(self.parts, self._split(history), strict=True)
+            return [of(part, own) for part, own in each]
         out, at = [], 0
         for part in self.parts:
             note = part.note(state)
@@ -85,6 +96,23 @@ class Several(Target):
             own = None if history is None or not size else history[..., at : at + size]
             out.append(of(part, own))
             at += size
+        return out
+
+    def _split(self, history: Tensor) -> list[Tensor | None]:
+        """The history of every part, 0 where a step had fewer columns: the first columns of each
+        step say how many belong to which."""
+        count = len(self.parts)
+        # a colony that has ended has no number
+        widths = history[:, :, :count].nan_to_num().amax(1).long().tolist()
+        steps = [
+            row[:, count : count + sum(own)].split(own, 1)
+            for row, own in zip(history, widths, strict=True)
+        ]
+        out: list[Tensor | None] = []
+        for k in range(count):
+            widest = max(own[k] for own in widths)
+            mine = [torch.nn.functional.pad(s[k], (0, widest - s[k].shape[1])) for s in steps]
+            out.append(torch.stack(mine) if widest else None)
         return out
 
     def losses(self, state: tf.State, history: Tensor | None = None) -> Tensor:

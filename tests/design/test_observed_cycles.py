@@ -7,7 +7,19 @@ import pytest
 import torch
 
 import torchfilm as tf
-from design import Objective, Observed, ObservedCourse, ObservedCycles, Parameter, Search, Task
+from design import (
+    Conditions,
+    Constrained,
+    Measured,
+    Objective,
+    Observed,
+    ObservedCourse,
+    ObservedCycles,
+    Parameter,
+    Search,
+    Task,
+    Weighted,
+)
 from design import colonies as runs
 from design.growing import FailedColony, FinishedColonies, grow
 from design.simulations import simulate_designs
@@ -15,7 +27,7 @@ from design.targets.cycles import COLUMNS, FEWEST, CellCycles, CycleStatistics, 
 from tests.design.searching import fragile, lit
 from torchfilm.tools.checks import InputError
 
-EVERY = CycleStatistics(lengths=True, sisters=True, mothers=True)
+EVERY = CycleStatistics(lengths=True, sisters=True, mothers=True, mothers_lengths=True)
 CAPS = 4.0 / 3.0 * 0.5  # µm of centreline whose volume is that of the caps
 
 
@@ -108,11 +120,72 @@ def test_cycles_and_relatives_are_those_of_the_tracks():
     assert np.isnan(by["mother birth"][:2]).all() and by["mother birth"][2] == by["birth"][0]
 
 
+@pytest.mark.parametrize("every", [2, 5])
+def test_simulated_cells_are_seen_in_frames_as_those_of_a_movie(run, every):
+    """The frames of a run, as a table of tracked cells, have the statistics of its notes."""
+    path, notes, state = run
+    rows = {name: [] for name in ("colony", "cell", "parent", "time_h", "length_um")}
+    with tf.Results(path) as results:
+        for frame in range(0, len(results.times), every):
+            table = results.table(frame)
+            for name in ("colony", "cell", "parent"):
+                rows[name] += table[name].tolist()
+            rows["length_um"] += table["length"].tolist()
+            rows["time_h"] += [float(results.times[frame])] * len(table["cell"])
+    data = ObservedCycles(tf.Lineage.from_table(rows))
+    assert data.plan.interval == pytest.approx(0.05 * every) and data.time == pytest.approx(4.0)
+    each = data.statistics(state, notes).mean(0)
+    np.testing.assert_allclose(each, data.values, rtol=2e-5, atol=2e-5)
+    # frames make what cells add vary more
+    bare = dict(zip(EVERY.names, EVERY.of(CellCycles.of_notes(notes), 3).mean(0), strict=True))
+    found = dict(zip(data.plan.names, data.values, strict=True))
+    assert found["added_length_cv"] > 1.02 * bare["added_length_cv"]
+    assert found["generation_time_h"] == pytest.approx(bare["generation_time_h"], rel=0.02)
+
+
+def test_what_no_frame_shows_is_not_known():
+    """Of a cell that is in one frame no growth, of one that is in none nothing."""
+    division = lambda mother, first: [mother + 1, 2.0, 0.5, first, first + 1, 1.0, 1.0]
+    none = [0.0] * 7
+    steps = [
+        [0.1, *division(0, 1), *none], [0.3, *division(1, 3), *division(2, 5)],
+        [0.45, *division(3, 7), *none], [1.2, *division(5, 9), *none],
+    ]  # fmt: skip
+    notes = torch.tensor(steps, dtype=torch.float64).unsqueeze(1)
+    cycles = CellCycles.of_notes(notes, 0.5)
+    # 1 and 2 are born at 0.1 and divide at 0.3, 3 at 0.45, before the frame at 0.5; 5 at 1.2
+    np.testing.assert_allclose(cycles.time, [np.nan, np.nan, np.nan, 1.0])
+    assert np.isnan(cycles.birth[:3]).all() and np.isfinite(cycles.birth[3])
+    cycles = CellCycles.of_notes(notes, 0.2)
+    np.testing.assert_allclose(cycles.time, [0.2, 0.2, 0.2, 0.8])
+    assert np.isnan(cycles.division[:3]).all() and np.isfinite(cycles.division[3])
+
+
+def test_frames_that_a_track_lacks_are_allowed_for():
+    """Of cells that grow by 1/h, some are seen late, and some are lost before they divide."""
+    cells = [(1, 0, 0, 30, 2.0, 1.0)]
+    for mother, first in ((1, 30), (2, 60), (3, 60)):
+        cells += [(len(cells) + k, mother, first, 30, 1.0 + 0.1 * k, 1.0) for k in (1, 2)]
+    whole = tracks(cells)
+    rows = {"cell": [], "parent": [], "time_min": [], "length_um": []}
+    for cell, parent, first, minutes, length, rate in cells:
+        kept = range(2 if cell == 2 else 0, round(minutes / 5) - (2 if cell == 3 else 0))
+        for k in kept:
+            volume = (length + CAPS) * np.exp(rate * k * 5 / 60)
+            values = cell, parent, first + 5 * k, volume - CAPS
+            for column, value in zip(rows.values(), values, strict=True):
+                column.append(value)
+    with pytest.warns(UserWarning, match="begin later than a frame"):
+        lacking = tf.Lineage.from_table(rows)
+    one, other = (CellCycles.of_lineage(x, 0.5).tables(1)[0] for x in (whole, lacking))
+    np.testing.assert_allclose(np.sort(one, 0), np.sort(other, 0), rtol=1e-9)
+
+
 def test_an_adder_a_sizer_and_a_timer_are_told_apart():
     births = np.array([1.0, 1.2, 1.5, 0.9])
     nothing = np.full(4, np.nan)
     at = lambda division: np.stack([np.full(4, 0.5), births, division, *[nothing] * 5], 1)
-    names = CycleStatistics(lengths=True, sisters=False, mothers=False).names
+    names = CycleStatistics(True, False, False, False).names
     slope = lambda rows: EVERY.of_rows(rows)[names.index("added_length_slope")]
     assert slope(at(births + 1.5)) == pytest.approx(0.0, abs=1e-12)
     assert slope(at(np.full(4, 3.0))) == pytest.approx(-1.0)
@@ -227,22 +300,17 @@ def test_what_is_refused(run, tmp_path):
     with tf.Results(path) as results:
         lineage = results.lineage()
     for wrong in (3.0, [], [lineage, None], "cells.csv"):
-        with pytest.raises(InputError, match=r"a tf\.Lineage, or a list of them"):
+        with pytest.raises(InputError, match=r"a tf\.Lineage, such as .* or a list of them"):
             ObservedCycles(wrong)
     few = tracks([(1, 0, 0, 30, 2.0, 1.0), (2, 1, 30, 20, 1.0, 1.0), (3, 1, 30, 40, 1.2, 1.2)])
     with pytest.raises(
         InputError, match=f"colony 0 = 0 is not allowed: it must be at least {FEWEST}"
     ):
         ObservedCycles(few)
-    with tf.Results(path) as results:
-        shorter = results.lineage()
-    shorter.now = 3.0
-    with pytest.raises(InputError, match="that last as long as each other"):
-        ObservedCycles([lineage, shorter])
     timed = ObservedCycles(unmeasured(tmp_path))
     with pytest.raises(InputError, match="of statistics that these data have"):
         ObservedCycles(unmeasured(tmp_path), like=ObservedCycles(lineage))
-    assert ObservedCycles(lineage, like=timed).plan == timed.plan
+    assert ObservedCycles(lineage, like=timed).plan.names == timed.plan.names
     data = ObservedCycles(lineage)
     with pytest.raises(InputError, match="an Observed or a Measured"):
         ObservedCourse([data, data])
@@ -252,6 +320,39 @@ def test_what_is_refused(run, tmp_path):
         ObservedCycles(lineage, radius=0.0)
     with pytest.raises(InputError, match="notes of all steps"):
         data.statistics(run[2])
+
+
+def test_movies_that_differ_are_refused():
+    family = [(1, 0, 0, 30, 2.0, 1.0)]
+    for mother, first in ((1, 30), (2, 60), (3, 60), (4, 90), (5, 90), (8, 120)):
+        family += [(len(family) + k, mother, first, 30, 1.0, 1.0) for k in (1, 2)]
+    rows = lambda shift, end: [(c, p, f + shift, m, b, r) for c, p, f, m, b, r in family if f < end]
+    whole = tracks(rows(0, 999))
+    assert ObservedCycles([whole, tracks(rows(180, 999))]).time == pytest.approx(whole.now)
+    with pytest.raises(InputError, match=r"colony 0 of lineages\[1\], seen for .* as long as each"):
+        ObservedCycles([whole, tracks(rows(0, 120))])
+    assert ObservedCycles([whole, tracks(rows(0, 120))], time=2.0).time == 2.0
+    with pytest.raises(InputError, match="the same interval between frames"):
+        ObservedCycles([whole, tracks(rows(0, 999), interval=10.0)])
+    for make in (ObservedCycles.from_results, ObservedCycles.from_table):
+        with pytest.raises(InputError, match="made of a lineage"):
+            make("run.h5")
+
+
+def test_relatives_that_only_some_colonies_have_are_told():
+    rich = [(1, 0, 0, 30, 2.0, 1.0)]
+    for mother in range(1, 40):
+        first = rich[mother - 1][2] + 30
+        rich += [(len(rich) + k, mother, first, 30, 1.0, 1.0 + 0.01 * mother) for k in (1, 2)]
+    lineage = tracks(rich)
+    few = tracks([row for row in rich if row[2] < 120])
+    told = [
+        pytest.warns(UserWarning, match=f"{who} are not compared: of the 2 colonies, one has")
+        for who in ("mothers and daughters", "sisters")
+    ]
+    with told[0], told[1]:
+        data = ObservedCycles([lineage, few], time=2.5)
+    assert "mothers" not in data.plan.groups
 
 
 def test_several_lineages_are_replicates(run):
@@ -270,3 +371,89 @@ def test_cells_of_another_width_are_warned_of(run):
         data = ObservedCycles(results.lineage(), radius=0.4)
     with pytest.warns(UserWarning, match=r"0\.80 µm wide"):
         data.check(state)
+
+
+# --- beside others ---------------------------------------------------------------------------
+
+
+def losses(target, points, **options):
+    task = Task(adder, [Parameter("added", 1.2, 2.0)], target, replicates=1, seed=3, **options)
+    return Objective(task).evaluate(np.array([[x] for x in points])).loss
+
+
+def test_cycles_beside_other_targets_have_the_same_loss(run):
+    """Whose notes have other numbers of columns in each step, alone and in a batch."""
+    path, _, _ = run
+    with tf.Results(path) as results:
+        data = ObservedCycles(results.lineage())
+    bare = losses(data, (0.2, 0.5, 0.9))
+    cells = lambda state: state.counts.double()
+    count = Measured({"n": cells}, wanted={"n": 60.0}, spread={"n": 9.0}, time=4.0)
+    other = losses(count, (0.2, 0.5, 0.9))
+    weighted = Weighted([(data, 1.0), (count, 0.5), (data, 2.0)])
+    together = losses(weighted, (0.2, 0.5, 0.9))
+    expected = losses(Weighted([(data, 3.0), (count, 0.5)]), (0.2, 0.5, 0.9))
+    np.testing.assert_allclose(together, expected, rtol=1e-12)
+    assert together.tolist() == [float(losses(weighted, [x])[0]) for x in (0.2, 0.5, 0.9)]
+    share = together / (3.0 * bare + 0.5 * other)  # of sums of weights, or not
+    np.testing.assert_allclose(share, share[0], rtol=1e-9)
+    bound = Constrained(data, at_most={"generation_time_h": 9.0})
+    np.testing.assert_allclose(losses(bound, (0.2, 0.9)), bare[[0, 2]], rtol=1e-12)
+
+
+def test_cycles_under_conditions(run):
+    path, _, _ = run
+    with tf.Results(path) as results:
+        data = ObservedCycles(results.lineage())
+    both = Conditions([({"noise": 0.1}, data), ({"noise": 0.2}, data)])
+    task = Task(adder, [Parameter("added", 1.2, 2.0)], both, replicates=1, seed=3)
+    found = Objective(task).evaluate(np.array([[0.5], [0.9]]))
+    assert not found.reasons and found.loss[0] < found.loss[1]
+    grown = simulate_designs(replace_target(task, both), 3)
+    assert not grown.reasons and np.isfinite(grown.statistics).all()
+    slow = Task(adder, [Parameter("rate", 0.1, 0.2)], both, replicates=1)
+    reason = simulate_designs(slow, 1).reasons[0]
+    assert "generation_time_h (noise = 0.1) is not a number, as the colony had fewer" in reason
+    short = ObservedCycles(results_lineage(path), time=3.0)
+    with pytest.raises(InputError, match=r"time of ObservedCycles = 3\.0 .* 4 h, as of the others"):
+        Conditions([({"noise": 0.1}, data), ({"noise": 0.2}, short)])
+
+
+def replace_target(task, target):
+    return Task(adder, [Parameter("added", 1.2, 2.0)], target, replicates=1, seed=task.seed)
+
+
+def results_lineage(path):
+    with tf.Results(path) as results:
+        return results.lineage()
+
+
+def test_measures_of_failed_colonies_are_asked_for_once(run, monkeypatch):
+    path, _, _ = run
+    with tf.Results(path) as results:
+        data = ObservedCycles(results.lineage())
+    asked, measures = [], ObservedCycles.measures
+    monkeypatch.setattr(
+        ObservedCycles, "measures", lambda *given: asked.append(1) or measures(*given)
+    )
+    task = Task(adder, [Parameter("rate", 0.1, 0.2)], data, replicates=1)
+    found = Objective(task).evaluate(np.linspace(0.0, 1.0, 12)[:, None])
+    assert len(found.reasons) == 12 and len(asked) <= 2
+
+
+def test_spreads_are_those_of_cycles_that_are_drawn_again(run):
+    """A mean varies by the spread of cells over the root of their number; each statistic has a
+    least spread of its own units."""
+    path, _, _ = run
+    with tf.Results(path) as results:
+        lineage = results.lineage()
+    (own, *_) = CellCycles.of_lineage(lineage, 0.5).tables(3)
+    drawn = dict(zip(EVERY.names, EVERY.resampled_spread(own), strict=True))
+    time = own[:, COLUMNS.index("time")]
+    assert drawn["generation_time_h"] == pytest.approx(time.std() / len(time) ** 0.5, rel=0.2)
+    data = ObservedCycles(lineage)
+    spread = dict(zip(data.plan.names, data.spread, strict=True))
+    assert spread["division_length_cv"] < 0.02 < spread["division_length_um"]
+    less = data.without("growth")
+    assert less.spread == tuple(spread[name] for name in less.plan.names)
+    assert data.cells == int((lineage.fate == "alive").sum())

@@ -114,7 +114,7 @@ class Rules(Effect):
 
     def _warn_of_unread(self) -> None:
         """Warn of constants that the code of no rule names."""
-        named = names_in(*(f for f in self.functions.values() if f is not None))
+        named = names_in("p", *(f for f in self.functions.values() if f is not None))
         if named is None:
             return
         if unread := [name for name in self.parameters if name not in named]:

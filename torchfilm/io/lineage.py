@@ -54,8 +54,9 @@ class Lineage:
     birth_length, end_length: of the centreline, µm, when it was born and ended; NaN where that hour
     is NaN, and in files of earlier versions but for founders · cell_type: when it ended, or in the
     last frame while it lives; −1 in a scene without types, and of ends in files of earlier versions
-    · founder: uid of the first of its line in the file. interval: h, between the frames of a movie,
-    0 of a run, whose births and ends are noted at every step.
+    · founder: uid of the first of its line in the file. first_seen, last_seen: h, of
+    its first and last frame, of a run when it was born and ended. interval: h, between the frames
+    of a movie; 0 of a run, whose births and ends are noted at every step.
 
     Cells are named by uid, and in a run of several colonies by `colony`, an id, too. `course` reads
     the file, which must be open. Raises InputError for cells and colonies that it does not have.
@@ -83,8 +84,7 @@ class Lineage:
         )
         self.fate = np.full(len(cell), "alive", dtype="<U8")
         self.cell_type = np.full(len(cell), -1)
-        # h: of the first frame of each cell, and of the last one of its colony
-        self._from, self._until = np.full(len(cell), begin), np.full(len(cell), now)
+        self.first_seen, self.last_seen = np.full(len(cell), begin), np.full(len(cell), now)
         self._order = np.argsort(_pair(colony, cell))
         self._keys = _pair(colony, cell)[self._order]
 
@@ -109,7 +109,7 @@ class Lineage:
         then = lambda t: np.interp(t["step"], steps, times)  # all that earlier versions have
         hours = lambda t: np.where(np.isnan(t["time"]), then(t), t["time"])
         made.born = np.concatenate([founded, hours(births)])
-        made._from = np.where(np.isnan(made.born), made.begin, made.born)
+        made.first_seen = np.where(np.isnan(made.born), made.begin, made.born)
         lengths = np.where(np.isnan(founded), np.nan, first["length"])
         made.birth_length = np.concatenate([lengths, births["length"]])
         at = made._rows(ends["colony_id"], ends["uid"])
@@ -118,6 +118,7 @@ class Lineage:
             raise InputError(
                 f"{results.path} is damaged: it has ends of no known fate. Use another copy of it."
             )
+        made.last_seen[at] = made.ended[at]
         made.fate[at], made.end_length[at] = np.asarray(FATES)[ends["fate"]], ends["length"]
         living = results.frame(last)
         if "cell_type" in living:
@@ -146,7 +147,8 @@ class Lineage:
         number for each movie. columns: their names where they differ. Units stand in the names, as
         in time_min and length_um, or in the arguments. width: µm, where lengths are those of whole
         cells so wide: it is taken off them. join: a track and its only daughter are one cell, of
-        the first's number, as where tracking lost a cell for some frames.
+        the first's number, as where tracking lost a cell for some frames; but not where it is
+        shorter than three quarters of what it was, since then it has divided.
 
         A cell is born in its first frame, if its parent is known, and divides as the first of its
         daughters begins. Without any it is "alive" in the last frame of its colony, and else
@@ -169,7 +171,8 @@ class Lineage:
             begin=float(tracks.first.min()), now=float(tracks.end.max()),
             known=np.unique(tracks.colony).tolist(),
         )  # fmt: skip
-        made._from, made._until, made.interval = tracks.first, tracks.end, tracks.interval
+        made.first_seen, made.last_seen = tracks.first, tracks.last
+        made.interval = tracks.interval
         known = tracks.parent >= 0
         made.born = np.where(known, tracks.first, np.nan)
         made.birth_length = np.where(known, tracks.birth_length, np.nan)
@@ -280,7 +283,7 @@ class Lineage:
             when = checks.number("clone_sizes(time)", time, least=self.begin, most=self.now)
         mine = self.colony == self.colony_of_run(colony)
         # a mother ends when her daughters are born; what has an unknown end is gone
-        there = (self._from <= when) & ((self.fate == "alive") | (self.ended > when))
+        there = (self.first_seen <= when) & ((self.fate == "alive") | (self.ended > when))
         alive = self.founder[mine & there]
         return {int(f): int((alive == f).sum()) for f in np.unique(self.founder[mine])}
 
@@ -325,7 +328,7 @@ class Lineage:
         living = self.fate == "alive"
         kept = with_ancestors(living, self._mothers) if alive else np.ones(len(self), bool)
         roots = [row for row in self._roots(colony) if kept[row]]
-        lived = np.where(np.isnan(self.ended), self._until, self.ended) - self._from
+        lived = np.where(np.isnan(self.ended), self.last_seen, self.ended) - self.first_seen
         name = lambda row: "colony{}.cell{}".format(*self._node(row))
         below = {row: [d for d in of if kept[d]] for row, of in self._daughters.items()}
         return "".join(f"{newick(row, below, lived, name)};\n" for row in roots)

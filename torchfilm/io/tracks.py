@@ -16,8 +16,11 @@ from torchfilm.tools.warn_once import warn
 
 MEANT = ("cell", "parent", "colony", "time", "length")
 NONE = -1  # of a parent
+SEVERAL = 3  # intervals of a colony, to know what is usual there
+OTHER = 1.2  # times an interval between frames, that is another one
 GAP = 1.5  # intervals between a mother and her daughter, above which frames are missing
 MOST_CELLS, MOST_COLONIES = 2**40, 2**20  # of which a tree tells numbers apart
+HALVED = 0.75  # of its length: less, from one frame to the next, tells of a division
 LOST = "lost"  # the fate of a track that ends before the movie, without daughters
 
 
@@ -63,7 +66,11 @@ def table_tracks(
         sizes = sizes - checks.number("Lineage.from_table(width)", width, above=0.0)
     if (sizes < 0.0).any():
         row = int(np.flatnonzero(sizes < 0.0)[0])
-        raise InputError(f"{given.place(row)}: {sizes[row]:g} µm is no length of a centreline.")
+        less = "" if width is None else f", less than the width of {width:g} µm that is taken off"
+        raise InputError(
+            f"{given.place(row)}: {sizes[row]:.3g} µm is no length of a centreline{less}. Give a"
+            " smaller width, or leave such rows out."
+        )
     units.check_used(used)
     cell = _whole(given, columns.get("cell", "cell"), MOST_CELLS)
     colony = np.zeros(given.rows, np.int64)
@@ -95,6 +102,15 @@ def _of_rows(
         )
     starts = np.flatnonzero(begins)
     ends = np.append(starts[1:], len(cell)) - 1
+    shrunk = np.flatnonzero(~begins & (sizes < HALVED * np.roll(sizes, 1)))
+    if shrunk.size:
+        cells = dict.fromkeys(cell[shrunk].tolist())
+        some = ", ".join(map(str, list(cells)[:8]))
+        warn(
+            f"{source}: {len(cells)} cells get shorter by a quarter or more from one frame to the"
+            f" next (such as {some}): have they divided? Each daughter is a cell with a number of"
+            " its own, and her mother as parent."
+        )
     # a program may name the mother in the first row of a track alone
     mothers = np.maximum.reduceat(parent, starts)
     of_track = np.repeat(np.arange(len(starts)), ends - starts + 1)
@@ -143,10 +159,23 @@ def challenge_tracks(path: str | Path, interval: float, join: bool) -> Tracks:
 
 
 def _interval(colony: np.ndarray, hours: np.ndarray) -> float:
-    """The usual time between frames of a colony, h; inf where each has one."""
+    """The usual time between frames of a colony, h; inf where each has one. Warns of colonies that
+    were seen at other intervals than others."""
     frames = np.unique(np.stack([colony.astype(float), hours], 1), axis=0)
-    apart = np.diff(frames[:, 1])[np.diff(frames[:, 0]) == 0]
-    return float(np.median(apart)) if len(apart) else np.inf
+    same = np.diff(frames[:, 0]) == 0
+    apart, of = np.diff(frames[:, 1])[same], frames[1:, 0][same]
+    if not len(apart):
+        return np.inf
+    known = [c for c in np.unique(of) if (of == c).sum() >= SEVERAL]
+    each = {int(c): float(np.median(apart[of == c])) for c in known}
+    one, other = (f(each, key=each.__getitem__) if each else 0 for f in (min, max))
+    if each and each[other] > OTHER * each[one]:
+        warn(
+            f"frames of colony {one} are {each[one]:.3g} h apart, those of colony {other}"
+            f" {each[other]:.3g} h: the lineage takes {np.median(apart):.3g} h for all. Read movies"
+            " of different intervals as lineages of their own."
+        )
+    return float(np.median(apart))
 
 
 def _with_gaps(given: tables.Table, column: str) -> np.ndarray:
@@ -219,15 +248,18 @@ def _checked(tracks: Tracks, join: bool) -> Tracks:
     found = _taken(tracks, np.argsort(tracks.first, kind="stable"))
     mothers = _mothers(found)
     count = np.bincount(mothers[mothers >= 0], minlength=len(mothers))
+    whole = _not_divided(found, mothers)
     if join and (count == 1).any():
-        found = _joined(found, mothers, count == 1)
+        found = _joined(found, mothers, (count == 1) & whole)
         mothers = _mothers(found)
         count = np.bincount(mothers[mothers >= 0], minlength=len(mothers))
     source, known = found.source, np.flatnonzero(mothers >= 0)
-    hint = " join=True takes a cell and its only daughter for one."
+    hint = "" if join else " join=True takes a cell and its only daughter for one."
+    several = len(np.unique(found.colony)) > 1
     for some, what, more in ((count == 1, "one daughter", hint), (count > 2, "more than two", "")):
         if some.any():
-            cells = ", ".join(map(str, found.cell[some][:8].tolist()))
+            names = zip(found.colony[some][:8].tolist(), found.cell[some][:8].tolist(), strict=True)
+            cells = ", ".join(f"{b} of colony {a}" if several else str(b) for a, b in names)
             warn(
                 f"{source}: {int(some.sum())} cells have {what} (such as {cells}): tracks may be"
                 f" cut or wrongly joined there. They count as divided.{more}"
@@ -275,9 +307,18 @@ def _mothers(tracks: Tracks) -> np.ndarray:
     return mothers
 
 
+def _not_divided(tracks: Tracks, mothers: np.ndarray) -> np.ndarray:
+    """Which tracks no daughter begins so much shorter than they end that they must have divided,
+    (N,) bool."""
+    whole, known = np.ones(len(mothers), bool), np.flatnonzero(mothers >= 0)
+    halved = tracks.birth_length[known] < HALVED * tracks.end_length[mothers[known]]
+    whole[mothers[known[halved]]] = False
+    return whole
+
+
 def _joined(tracks: Tracks, mothers: np.ndarray, single: np.ndarray) -> Tracks:
-    """Each track and its only daughter as one, of the mother's number. single: those that have one
-    daughter, (N,) bool. Mothers stand before daughters."""
+    """Each track and its only daughter as one, of the mother's number. single: those to join with
+    theirs, (N,) bool. Mothers stand before daughters."""
     root = np.arange(len(mothers))
     end = root.copy()  # the last part of each
     for k in np.flatnonzero(mothers >= 0).tolist():

@@ -66,8 +66,8 @@ def pairs_within(
 ) -> tuple[Tensor, Tensor]:
     """Pairs of one colony whose surfaces are at most `within` µm apart: first and second, (P,), by
     a kernel where there can be one. groups: the cells of each colony, which stand side by side. The
-    rest as for `gaps_nearby`. A colony has the same pairs in the same order whatever the batch; one
-    with numbers that are not finite has none there."""
+    rest as for `gaps_nearby`. A colony has the same pairs in the same order whatever the batch. The
+    kernel finds none in a colony with numbers that are not finite; torch refuses these."""
     cells = position, axis, length, radius
     if position.device.type != "cpu" or space is not None or unavailable():
         i, j, gap = gaps_nearby(*cells, groups.owner, groups.size, within, space)

@@ -17,12 +17,12 @@ from torchfilm.tools import checks
 UNITS: dict[str, dict[str, float | None]] = {
     "length": {"um": 1.0, "px": None},
     "angle": {"rad": 1.0, "deg": math.pi / 180.0},
-    "time": {"h": 1.0, "min": 1.0 / 60.0},
+    "time": {"h": 1.0, "min": 1.0 / 60.0, "s": 1.0 / 3600.0},
 }
 HINTS = {
     "length": 'Give pixel_size=… (µm a pixel) or length_unit="um", or call the column "{0}_um".',
     "angle": 'Give angle_unit="degrees" or "radians", or call the column "{0}_deg" or "{0}_rad".',
-    "time": 'Give time_unit="h" or "min", or call the column "{0}_h" or "{0}_min".',
+    "time": 'Give time_unit="h", "min" or "s", or call the column "{0}_h", "{0}_min" or "{0}_s".',
 }
 # the same units as people write them, too; there are two signs for micro
 SPELLINGS = {"µm": "um", "\u03bcm": "um", "degrees": "deg", "radians": "rad"}
@@ -31,7 +31,7 @@ SPELLINGS = {"µm": "um", "\u03bcm": "um", "degrees": "deg", "radians": "rad"}
 @dataclass(frozen=True)
 class Units:
     """The units that arguments state. pixel_size: µm a pixel. length_unit: "um" ("µm") or "px".
-    angle_unit: "degrees" ("deg") or "radians" ("rad"). time_unit: "h" or "min"."""
+    angle_unit: "degrees" ("deg") or "radians" ("rad"). time_unit: "h", "min" or "s"."""
 
     pixel_size: float | None = None
     length_unit: str | None = None
@@ -44,7 +44,7 @@ class Units:
         for name, kind, usual in (
             ("length_unit", "length", ("um", "px")),
             ("angle_unit", "angle", ("degrees", "radians")),
-            ("time_unit", "time", ("h", "min")),
+            ("time_unit", "time", ("h", "min", "s")),
         ):
             given = getattr(self, name)
             if given is not None and _unit(given) not in UNITS[kind]:
