@@ -28,6 +28,44 @@ def test_dense_cells_find_room(dim, count, radius):
     assert np.linalg.norm(cells.position, axis=1).max() <= radius
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_cells_are_scattered_evenly_in_a_box(dim):
+    low, high = np.array([10.0, -3.0, 0.0][:dim]), np.array([50.0, 3.0, 20.0][:dim])
+    cells = tf.inoculum(30, box=(low, high), colonies=20, dim=dim, seed=2)
+    share = (cells.position - low) / (high - low)
+    assert cells.overlaps() == [] and share.min() >= 0.0 and share.max() <= 1.0
+    # five standard errors of 600 even numbers, and of their spread
+    assert np.abs(share.mean(0) - 0.5).max() < 5 / np.sqrt(12 * 600)
+    assert share.std(0) == pytest.approx([1 / np.sqrt(12)] * dim, rel=0.1)
+    assert np.abs(cells.axis.mean(0)).max() < 5 / np.sqrt(dim * 600)
+
+
+def test_a_disc_may_lie_elsewhere():
+    here, there = (tf.inoculum(20, 9.0, center=at, seed=1) for at in (None, (30.0, -4.0)))
+    assert np.allclose(there.position, here.position + np.array([30.0, -4.0]))
+    assert np.array_equal(there.axis, here.axis)
+    flat = tf.inoculum(20, box=((0, 0), (30, 8)), dim=3, floor=0.0)
+    assert (flat.position[:, 2] == 0.5).all() and flat.position[:, 1].max() <= 8.0
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({}, r"radius = None .* given, or box="),
+        ({"radius": 5.0, "box": ((0, 0), (9, 9))}, "radius = 5.0 .* left out with a box"),
+        ({"box": ((0, 0), (9, 9)), "center": (1, 1)}, "center = .* left out with a box"),
+        ({"box": ((0, 9), (9, 0))}, "box = .* the lower corner first"),
+        ({"box": ((0, 0, 0), (9, 9, 9))}, r"box\[0\]"),
+        ({"box": 7.0}, "box = 7.0 .* the lower and the upper corner"),
+        ({"radius": 5.0, "center": (1, 2, 3)}, "center"),
+        ({"box": ((0, 0), (9, 2))}, "box = .* wide enough .* give a greater box"),
+    ],
+)
+def test_places_that_cannot_be_are_refused(given, words):
+    with pytest.raises(tf.InputError, match=words):
+        tf.inoculum(40, **given)
+
+
 def test_cells_lie_on_a_floor():
     cells = tf.inoculum(40, radius=12.0, dim=3, floor=-1.0, cell_radius=0.4, colonies=2, seed=5)
     flat = tf.inoculum(40, radius=12.0, cell_radius=0.4, colonies=2, seed=5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,10 @@ ROUNDS = 2000  # in which cells that overlap others are placed again
 @checks.known_keywords
 def inoculum(
     count: int,
-    radius: float,
+    radius: float | None = None,
     *,
+    box: tuple[Sequence[float], Sequence[float]] | None = None,
+    center: Sequence[float] | None = None,
     types: Mapping[int, float] | None = None,
     colonies: int = 1,
     dim: int = 2,
@@ -35,19 +38,20 @@ def inoculum(
 
         founders = tf.inoculum(30, radius=15.0, types={0: 0.9, 1: 0.1}, colonies=8)
 
-    radius: of the disc, in 3-D the ball, that contains their centres, µm. types: the share of each
-    cell type, which together are 1; each colony has these shares, as near as whole numbers of cells
-    come to them, and who is of which type is drawn. dim: 2 or 3. length: of the centreline, µm: one
-    number; tf.Uniform(2, 4) to draw each, since cells of one length divide all at once; a dict of
-    these by type, {0: 2.0, 1: tf.Uniform(0, 1)}; or one for each of `count` cells, the same in all
-    colonies. cell_radius: µm, one number, or a dict by type. floor: in 3-D, µm: cells lie flat on a
-    floor at this z, in a disc around the z axis, instead of in a ball. No two cells overlap. Colony
+    radius: of the disc, in 3-D the ball, that contains their centres, µm. box: in its place the
+    lower and upper corner of the rectangle, or block, that does: box=((0, 0), (100, 4)) for a
+    front. center: of the disc, µm, by default the origin. types: the share of each cell type, which
+    together are 1; each colony has these shares, as near as whole numbers of cells come to them,
+    and who is of which type is drawn. dim: 2 or 3. length: of the centreline, µm: one number;
+    tf.Uniform(2, 4) to draw each, since cells of one length divide all at once; a dict of these by
+    type, {0: 2.0, 1: tf.Uniform(0, 1)}; or one for each of `count` cells, the same in all colonies.
+    cell_radius: µm, one number, or a dict by type. floor: in 3-D, µm: cells lie flat on a floor at
+    this z, in a disc or a rectangle, instead of in a ball or a block. No two cells overlap. Colony
     k is the same whatever their number.
     Raises InputError for shares that do not sum to 1, and where the cells do not find room: rods
     placed one after the other at random fill at most about 45 % of an area, 30 % of a volume.
     """
     checks.integer("count", count, least=1)
-    checks.number("radius", radius, least=0.0)
     checks.integer("colonies", colonies, least=1)
     checks.choice("dim", dim, (2, 3))
     checks.integer("seed", seed, least=0)
@@ -61,9 +65,9 @@ def inoculum(
         checks.number("floor", floor)
         if dim == 2:
             raise checks.input_error("floor", floor, "left out with dim=2", "Take dim=3.")
-    placed_in = 2 if floor is not None else dim
+    place = _place(radius, box, center, 2 if floor is not None else dim)
     made = [
-        _colony(np.random.default_rng([seed, k]), radius, placed_in, lengths[k], radii[k])
+        _colony(np.random.default_rng([seed, k]), place, lengths[k], radii[k])
         for k in range(colonies)
     ]
     if floor is not None:
@@ -172,39 +176,98 @@ def _types(rng: np.random.Generator, count: int, shares: dict[int, float] | None
     return rng.permutation(np.repeat(list(shares), numbers))
 
 
+@dataclass(frozen=True)
+class _Disc:
+    """A disc or a ball."""
+
+    radius: float
+    center: np.ndarray
+    name = "radius"
+
+    def places(self, rng: np.random.Generator, way: np.ndarray) -> np.ndarray:
+        """As many as there are ways, (n, dim): unit vectors at random."""
+        n, dim = way.shape
+        return self.center + self.radius * rng.random((n, 1)) ** (1 / dim) * way
+
+    def size(self, margin: float) -> float:
+        """Area or volume, with a margin around."""
+        whole, dim = self.radius + margin, len(self.center)
+        return np.pi * whole**2 if dim == 2 else 4.0 / 3.0 * np.pi * whole**3
+
+    def given(self) -> Any:
+        return self.radius
+
+
+@dataclass(frozen=True)
+class _Block:
+    """A rectangle or a block."""
+
+    low: np.ndarray
+    high: np.ndarray
+    name = "box"
+
+    def places(self, rng: np.random.Generator, way: np.ndarray) -> np.ndarray:
+        """As many as there are ways, (n, dim)."""
+        return self.low + (self.high - self.low) * rng.random(way.shape)
+
+    def size(self, margin: float) -> float:
+        """Area or volume, with a margin around."""
+        return float((self.high - self.low + 2.0 * margin).prod())
+
+    def given(self) -> Any:
+        return self.low.tolist(), self.high.tolist()
+
+
+def _place(radius: Any, box: Any, center: Any, dim: int) -> _Disc | _Block:
+    """Where the centres of cells lie, checked."""
+    if box is None:
+        if radius is None:
+            raise checks.input_error("radius", None, "given, or box=((x, y), (x, y)), µm")
+        checks.number("radius", radius, least=0.0)
+        at = (0.0,) * dim if center is None else checks.vector("center", center, dim)
+        return _Disc(float(radius), np.array(at))
+    for name, value in (("radius", radius), ("center", center)):
+        if value is not None:
+            raise checks.input_error(name, value, "left out with a box")
+    if not isinstance(box, (tuple, list)) or len(box) != 2:
+        raise checks.input_error("box", box, "the lower and the upper corner, µm")
+    low, high = (np.array(checks.vector(f"box[{k}]", corner, dim)) for k, corner in enumerate(box))
+    if (high < low).any():
+        raise checks.input_error("box", box, "the lower corner first, and then the upper one")
+    return _Block(low, high)
+
+
 def _colony(
-    rng: np.random.Generator, radius: float, dim: int, length: np.ndarray, cell_radius: np.ndarray
+    rng: np.random.Generator, place: _Disc | _Block, length: np.ndarray, cell_radius: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions and axes of the cells of a colony, (count, dim) each; length, cell_radius:
     (count,)."""
     count = len(length)
+    dim = len(place.center if isinstance(place, _Disc) else place.low)
     position, axis = np.empty((count, dim)), np.empty((count, dim))
     again = np.arange(count)
     for _ in range(ROUNDS):
         way = rng.normal(size=(2, len(again), dim))
         way /= np.linalg.norm(way, axis=2, keepdims=True)
-        position[again] = radius * rng.random((len(again), 1)) ** (1 / dim) * way[0]
+        position[again] = place.places(rng, way[0])
         axis[again] = way[1]
         again = _overlapping(position, axis, length, cell_radius, again)
         if not again.size:
             return position, axis
     wide = " or ".join(f"{r:g}" for r in np.unique(cell_radius))
     raise checks.input_error(
-        "radius", radius, "wide enough for the cells",
+        place.name, place.given(), "wide enough for the cells",
         f"{count} cells of length {length.mean():g} and radius {wide} µm would fill"
-        f" {_filled(radius, dim, length, cell_radius):.0%} of it, and did not find room in"
-        f" {ROUNDS} rounds: give a greater radius, or fewer cells.",
+        f" {_filled(place, dim, length, cell_radius):.0%} of it, and did not find room in"
+        f" {ROUNDS} rounds: give a greater {place.name}, or fewer cells.",
     )  # fmt: skip
 
 
-def _filled(radius: float, dim: int, length: np.ndarray, cell_radius: np.ndarray) -> float:
-    """The share of the disc, or the ball, that cells fill; those at its rim stick out of it."""
+def _filled(place: _Disc | _Block, dim: int, length: np.ndarray, cell_radius: np.ndarray) -> float:
+    """The share of the place that cells fill; those at its rim stick out of it."""
     across, around = 2.0 * length * cell_radius, np.pi * cell_radius**2
-    whole = radius + float(cell_radius.max())
-    if dim == 2:
-        return float((across + around).sum()) / (np.pi * whole**2)
-    volume = around * (length + 4.0 / 3.0 * cell_radius)
-    return float(volume.sum()) / (4.0 / 3.0 * np.pi * whole**3)
+    each = across + around if dim == 2 else around * (length + 4.0 / 3.0 * cell_radius)
+    return float(each.sum()) / place.size(float(cell_radius.max()))
 
 
 def _lying(position: np.ndarray, axis: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
