@@ -152,3 +152,16 @@ def test_a_gradient_that_founders_lose_is_warned_of():
     with pytest.warns(UserWarning, match=r"Cells\.length requires a gradient"):
         cells = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], length=[torch.tensor(3.0, requires_grad=True)])
     assert cells.length.tolist() == [3.0]
+
+
+def test_columns_of_nearly_the_name_of_a_species_are_told():
+    circuit = tf.Circuit(lambda u, s, p, cell: {"gfp": 1.0 - u.gfp}, species="gfp")
+
+    def bound(name):
+        cells = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 2.0, extra={name: [2.0]})
+        return tf.Scene(circuit, tf.Growth(rate=1.0), founders=cells, dim=2).bind()
+
+    with pytest.warns(UserWarning, match="a column 'GFP', and the scene has 'gfp': should they"):
+        bound("GFP")
+    assert float(bound("gfp").start().gfp[0]) == 2.0  # without a warning
+    bound("age")

@@ -127,6 +127,19 @@ def warn_of_kept(effects: Sequence[BoundEffect], state: State, own: Container[st
                 )
 
 
+def warn_of_other_names(state: State, own: Iterable[str]) -> None:
+    """Warn of columns of the first cells whose names differ from those of fields by capitals or
+    underscores alone."""
+    plain = lambda name: name.lower().replace("_", "")
+    there = {plain(n): n for n, f in state.declared.items() if n not in own}
+    for name in own:
+        if (like := there.get(plain(name))) is not None:
+            warn(
+                f"the first cells have a column {name!r}, and the scene has {like!r}: should they"
+                " have one name?"
+            )
+
+
 def _few(values: Tensor) -> str:
     each = values.unique().tolist()
     return ", ".join(f"{x:g}" for x in each[:4]) + (", …" if len(each) > 4 else "")

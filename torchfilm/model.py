@@ -371,6 +371,7 @@ def bind(
         effect.check(first)
     if check_first and only is None:
         binding_checks.warn_of_idle(model.effects, first)
+        binding_checks.warn_of_other_names(first, founders.extra)
     binding_checks.warn_of_births(model.effects)
     return model
 
