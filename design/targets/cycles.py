@@ -74,7 +74,7 @@ class CycleStatistics:
         """The statistics of each of some colonies, (C, K); NaN of those with fewer than 3 complete
         cycles."""
         each = cycles.tables(colonies)
-        nothing = [np.nan] * len(self.names)
+        nothing = np.full(len(self.names), np.nan)
         return np.array([self.of_rows(own) if len(own) >= FEWEST else nothing for own in each])
 
     @property
@@ -82,17 +82,19 @@ class CycleStatistics:
         """Each statistic as a group of its own: they differ in their units."""
         return {name: (name,) for name in self.names}
 
-    def of_rows(self, rows: np.ndarray) -> list[float]:
-        """The statistics of the cycles of one colony, (K,), from rows of `CellCycles.table`."""
-        columns = dict(zip(COLUMNS, np.ascontiguousarray(rows.T), strict=True))
-        return [MEASURES[name](columns) for name in self.names]
+    def of_rows(self, rows: np.ndarray) -> np.ndarray:
+        """The statistics of the cycles of one colony, (K,), from rows (M, 8) of
+        `CellCycles.tables`; of several such, (…, K) from (…, M, 8)."""
+        each = np.ascontiguousarray(np.moveaxis(rows, -1, 0))
+        columns = dict(zip(COLUMNS, each, strict=True))
+        return np.stack([MEASURES[name](columns) for name in self.names], -1)
 
     def resampled_spread(self, rows: np.ndarray) -> np.ndarray:
         """The standard deviation of each statistic (K,) when the cycles of one colony are drawn
         again with replacement."""
-        draws = np.random.default_rng(0)
-        each = [self.of_rows(rows[draws.integers(len(rows), size=len(rows))]) for _ in range(DRAWN)]
-        return np.nanstd(np.array(each), axis=0)
+        count = len(rows)
+        drawn = np.random.default_rng(0).integers(count, size=(DRAWN, count))
+        return np.nanstd(self.of_rows(rows[drawn]), axis=0)
 
 
 # of a cycle, its mother's and its sister's; NaN where these are not known
@@ -260,61 +262,69 @@ def division_note(state: tf.State) -> Tensor:
     return torch.cat([time, found.flatten(1)], 1)
 
 
-def _mean(name: str) -> Callable[[Columns], float]:
-    return lambda columns: _average(columns[name])
+def _known(*columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which cycles have all of these values, (…, M), and how many do, (…,); NaN for fewer than
+    two."""
+    both = np.logical_and.reduce([np.isfinite(x) for x in columns])
+    count = both.sum(-1).astype(float)
+    return both, np.where(count > 1, count, np.nan)
 
 
-def _average(values: np.ndarray) -> float:
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) else np.nan
+def _average(values: np.ndarray) -> np.ndarray:
+    """The mean of the known ones, (…, M) -> (…,)."""
+    known, count = _known(values)
+    return np.where(known, values, 0.0).sum(-1) / count
 
 
-def _variation(values: np.ndarray) -> float:
+def _deviations(*columns: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+    """From the means of those cycles that have all of these values, 0 in others; and how many have
+    them."""
+    both, count = _known(*columns)
+    out = []
+    for x in columns:
+        own = np.where(both, x, 0.0)
+        apart = np.where(both, own - (own.sum(-1) / count)[..., None], 0.0)
+        # no more than rounding is nothing
+        least = STEADY * np.abs(own).max(-1, initial=0.0)
+        steady = (apart * apart).sum(-1) <= count * least * least
+        out.append(np.where(steady[..., None], 0.0, apart))
+    return out, count
+
+
+def _variation(values: np.ndarray) -> np.ndarray:
     """The coefficient of variation."""
-    known = values[np.isfinite(values)]
-    mean = float(known.mean()) if len(known) > 1 else 0.0
-    return float(known.std(ddof=1)) / mean if mean else np.nan
+    (apart,), count = _deviations(values)
+    mean = _average(values)
+    return np.sqrt((apart * apart).sum(-1) / (count - 1.0)) / np.where(mean == 0.0, np.nan, mean)
 
 
-def _deviations(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
-    """The covariance of values that are both known, and the variances of both; 0 for one that
-    varies by no more than rounding."""
-    both = np.isfinite(x) & np.isfinite(y)
-    if both.sum() < FEWEST:
-        return np.nan, np.nan, np.nan
-    x, y = x[both], y[both]
-    of = [values - values.mean() for values in (x, y)]
-    squares = [float((d * d).mean()) for d in of]
-    for k, values in enumerate((x, y)):
-        if squares[k] <= (STEADY * float(np.abs(values).max())) ** 2:
-            squares[k] = 0.0
-    return float((of[0] * of[1]).mean()), squares[0], squares[1]
+def _correlation(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """0 where one does not vary; NaN of fewer than 3 pairs."""
+    (of_x, of_y), count = _deviations(x, y)
+    squares = (of_x * of_x).sum(-1) * (of_y * of_y).sum(-1)
+    found = (of_x * of_y).sum(-1) / np.sqrt(np.where(squares > 0, squares, 1.0))
+    return np.where(count >= FEWEST, found, np.nan)
 
 
-def _correlation(x: np.ndarray, y: np.ndarray) -> float:
-    together, of_x, of_y = _deviations(x, y)
-    if np.isnan(together):
-        return np.nan
-    return together / float(np.sqrt(of_x * of_y)) if of_x and of_y else 0.0
+def _slope(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Of y on x; 0 where x does not vary, NaN of fewer than 3 pairs."""
+    (of_x, of_y), count = _deviations(x, y)
+    square = (of_x * of_x).sum(-1)
+    found = (of_x * of_y).sum(-1) / np.where(square > 0, square, 1.0)
+    return np.where(count >= FEWEST, found, np.nan)
 
 
-def _slope(x: np.ndarray, y: np.ndarray) -> float:
-    """Of y on x."""
-    together, of_x, _ = _deviations(x, y)
-    return together / of_x if of_x else np.nan if np.isnan(together) else 0.0
-
-
-MEASURES: dict[str, Callable[[Columns], float]] = {
-    "generation_time_h": _mean("time"),
+MEASURES: dict[str, Callable[[Columns], np.ndarray]] = {
+    "generation_time_h": lambda c: _average(c["time"]),
     "generation_time_cv": lambda c: _variation(c["time"]),
-    "birth_length_um": _mean("birth"),
+    "birth_length_um": lambda c: _average(c["birth"]),
     "birth_length_cv": lambda c: _variation(c["birth"]),
-    "division_length_um": _mean("division"),
+    "division_length_um": lambda c: _average(c["division"]),
     "division_length_cv": lambda c: _variation(c["division"]),
     "added_length_um": lambda c: _average(c["division"] - c["birth"]),
     "added_length_cv": lambda c: _variation(c["division"] - c["birth"]),
     "added_length_slope": lambda c: _slope(c["birth"], c["division"] - c["birth"]),
-    "growth_per_h": _mean("growth"),
+    "growth_per_h": lambda c: _average(c["growth"]),
     "growth_cv": lambda c: _variation(c["growth"]),
     "generation_time_sisters": lambda c: _correlation(c["time"], c["sister time"]),
     "generation_time_mothers": lambda c: _correlation(c["time"], c["mother time"]),
