@@ -14,6 +14,8 @@ import torch
 
 # two workers share two cores: more threads each would only make them wait for one another
 torch.set_num_threads(1)
+# a look at all objects takes seconds in a whole run, and there are few cycles to find
+gc.set_threshold(7000, 20, 10)
 
 # The suite draws the same examples on every run. TORCHFILM_EXPLORE=1 draws new ones.
 hypothesis.settings.register_profile(
