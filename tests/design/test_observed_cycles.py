@@ -339,11 +339,17 @@ def test_movies_that_differ_are_refused():
             make("run.h5")
 
 
-def test_relatives_that_only_some_colonies_have_are_told():
-    rich = [(1, 0, 0, 30, 2.0, 1.0)]
+def varied_family():
+    """Cells that divide every half an hour, each pair of sisters with a growth rate of its own."""
+    family = [(1, 0, 0, 30, 2.0, 1.0)]
     for mother in range(1, 40):
-        first = rich[mother - 1][2] + 30
-        rich += [(len(rich) + k, mother, first, 30, 1.0, 1.0 + 0.01 * mother) for k in (1, 2)]
+        first = family[mother - 1][2] + 30
+        family += [(len(family) + k, mother, first, 30, 1.0, 1.0 + 0.01 * mother) for k in (1, 2)]
+    return family
+
+
+def test_relatives_that_only_some_colonies_have_are_told():
+    rich = varied_family()
     lineage = tracks(rich)
     few = tracks([row for row in rich if row[2] < 120])
     told = [
@@ -414,6 +420,16 @@ def test_cycles_under_conditions(run):
     slow = Task(adder, [Parameter("rate", 0.1, 0.2)], both, replicates=1)
     reason = simulate_designs(slow, 1).reasons[0]
     assert "generation_time_h (noise = 0.1) is not a number, as the colony had fewer" in reason
+    one = Conditions([({"rate": 1.2}, data), ({"rate": 0.15}, data)])
+    found = Objective(Task(adder, [Parameter("added", 1.2, 2.0)], one, replicates=2)).evaluate(
+        np.array([[0.5]])
+    )
+    for replicate in range(2):
+        reason = found.reasons[0, replicate]
+        assert reason.startswith(
+            "where rate = 0.15: the target's loss was nan: generation_time_h (r"
+        )
+        assert "generation_time_h (rate = 0.15) was not a number, as the colony had fewer" in reason
     short = ObservedCycles(results_lineage(path), time=3.0)
     with pytest.raises(InputError, match=r"time of ObservedCycles = 3\.0 .* 4 h, as of the others"):
         Conditions([({"noise": 0.1}, data), ({"noise": 0.2}, short)])
@@ -454,6 +470,12 @@ def test_spreads_are_those_of_cycles_that_are_drawn_again(run):
     data = ObservedCycles(lineage)
     spread = dict(zip(data.plan.names, data.spread, strict=True))
     assert spread["division_length_cv"] < 0.02 < spread["division_length_um"]
+    alone = ObservedCycles(tracks(varied_family()))
+    own = CellCycles.of_lineage(tracks(varied_family()), 0.5).tables(1)[0]
+    by = dict(zip(alone.plan.names, alone.plan.resampled_spread(own), strict=True))
+    assert dict(zip(alone.plan.names, alone.spread, strict=True))["growth_cv"] == pytest.approx(
+        by["growth_cv"]
+    )
     less = data.without("growth")
     assert less.spread == tuple(spread[name] for name in less.plan.names)
     assert data.cells == int((lineage.fate == "alive").sum())
