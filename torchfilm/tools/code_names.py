@@ -53,11 +53,11 @@ def _is_plain(thing: Any) -> bool:
     """Whether something reads no attribute of what a function gives to it."""
     if isinstance(thing, ModuleType):
         return thing.__name__.split(".")[0] in KNOWN_MODULES
-    package = (getattr(thing, "__module__", "") or "").split(".")[0]
-    known = (
-        package in KNOWN_MODULES or getattr(builtins, getattr(thing, "__name__", ""), 0) is thing
-    )
-    return isinstance(thing, PLAIN) or known
+    module, name = (getattr(thing, of, "") for of in ("__module__", "__name__"))
+    if isinstance(module, str) and module.split(".")[0] in KNOWN_MODULES:
+        return True
+    is_builtin = isinstance(name, str) and getattr(builtins, name, None) is thing
+    return isinstance(thing, PLAIN) or (is_builtin and thing is not None)
 
 
 def _of_code(code: CodeType, whole: str) -> set[str] | None:
