@@ -62,8 +62,9 @@ def grow(
         yield from failed
         if bool(gone.all()):
             return
-        births = state.births  # which a note may tell of, and a part of a state does not know
-        state = _keep(state, ~gone).replace(births=births)
+        kept = _keep(state, ~gone)
+        # a note may tell of births, of which a part of a state does not know
+        state = kept if kept is state else kept.replace(births=state.births)
         found = note(state)
         if found is not None:
             row = found.new_full((count, *found.shape[1:]), torch.nan)

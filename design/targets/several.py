@@ -99,21 +99,25 @@ class Several(Target):
         return out
 
     def _split(self, history: Tensor) -> list[Tensor | None]:
-        """The history of every part, 0 where a step had fewer columns: the first columns of each
-        step say how many belong to which."""
+        """The notes of every part where their widths differ from step to step."""
+        return [x if x.shape[2] else None for x in self.parted(history, 0)]
+
+    def parted(self, history: Tensor, begin: int) -> list[Tensor]:
+        """The columns of every part, 0 where a step had fewer, of a history in which a column for
+        each part, from `begin` on, says how many of those that follow belong to it."""
         count = len(self.parts)
+        told = tf.tangents.both(history[:, :, begin : begin + count])[0]
         # a colony that has ended has no number
-        widths = history[:, :, :count].nan_to_num().amax(1).long().tolist()
+        widths = told.nan_to_num().amax(1).long()
+        start, widest = begin + count, widths.amax(0).tolist()
         steps = [
-            row[:, count : count + sum(own)].split(own, 1)
-            for row, own in zip(history, widths, strict=True)
+            row[:, start : start + sum(own)].split(own, 1)
+            for row, own in zip(history, widths.tolist(), strict=True)
         ]
-        out: list[Tensor | None] = []
-        for k in range(count):
-            widest = max(own[k] for own in widths)
-            mine = [torch.nn.functional.pad(s[k], (0, widest - s[k].shape[1])) for s in steps]
-            out.append(torch.stack(mine) if widest else None)
-        return out
+        return [
+            torch.stack([torch.nn.functional.pad(s[k], (0, most - s[k].shape[1])) for s in steps])
+            for k, most in enumerate(widest)
+        ]
 
     def losses(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         """The loss of every part, (B, parts)."""
@@ -207,22 +211,11 @@ class SumOfTargets(Several):
         """What `course` kept of each part, (T, B, k), or what `note` did."""
         notes = self.of_parts(lambda part, own: own, state, history)
         first = sum(0 if n is None else n.shape[2] for n in notes)
-        if history.shape[2] == first:
+        # a target with ragged notes has no derivatives, so that nobody asks for its course
+        if self.ragged or history.shape[2] == first:
             return notes
-        told = tf.tangents.both(history[:, :, first : first + len(notes)])[0]
-        # a colony that has ended has no number
-        widths = told.nan_to_num().amax(1).long()
-        begin, widest = first + len(notes), widths.amax(0).tolist()
-        steps = [
-            row[:, begin : begin + sum(own)].split(own, 1)
-            for row, own in zip(history, widths.tolist(), strict=True)
-        ]
-        out: list[Tensor | None] = []
-        for k, note in enumerate(notes):
-            pad = [(0, widest[k] - more[k].shape[1]) for more in steps]
-            more = [torch.nn.functional.pad(m[k], p) for m, p in zip(steps, pad, strict=True)]
-            out.append(None if note is None else torch.cat([note, torch.stack(more)], 2))
-        return out
+        each = zip(notes, self.parted(history, first), strict=True)
+        return [None if note is None else torch.cat([note, more], 2) for note, more in each]
 
     @property
     def squares(self) -> bool:

@@ -52,6 +52,11 @@ def run(tmp_path_factory):
     return path, stacked(notes), state
 
 
+def results_lineage(path):
+    with tf.Results(path) as results:
+        return results.lineage()
+
+
 def stacked(notes):
     widest = max(n.shape[1] for n in notes)
     return torch.stack([torch.nn.functional.pad(n, (0, widest - n.shape[1])) for n in notes])
@@ -73,8 +78,7 @@ def tracks(cells, interval=5.0):
 
 def test_notes_of_steps_tell_what_the_lineage_of_a_run_tells(run):
     path, notes, state = run
-    with tf.Results(path) as results:
-        lineage = results.lineage()
+    lineage = results_lineage(path)
     data = ObservedCycles(lineage)
     assert data.colonies == 3 and data.cycles > 100 and data.time == pytest.approx(4.0)
     each = data.statistics(state, notes).numpy()
@@ -241,8 +245,7 @@ def test_recorded_growth_has_the_same_cycles(replay):
 
 def test_a_search_finds_what_the_cells_add(run):
     path, _, _ = run
-    with tf.Results(path) as results:
-        data = ObservedCycles(results.lineage())
+    data = ObservedCycles(results_lineage(path))
     added = Parameter("added", 0.9, 2.8, log=True)
     best = Search(adder, [added], data, replicates=2, seed=1).run(64, progress=False)
     assert best.values["added"] == pytest.approx(1.6, rel=0.05)
@@ -251,8 +254,7 @@ def test_a_search_finds_what_the_cells_add(run):
 
 def test_a_colony_with_few_cycles_fails_with_the_reason(run):
     path, _, _ = run
-    with tf.Results(path) as results:
-        data = ObservedCycles(results.lineage())
+    data = ObservedCycles(results_lineage(path))
     slow = Parameter("rate", 0.1, 0.2)
     task = Task(adder, [slow], data, replicates=1)
     found = Objective(task).evaluate(np.array([[0.5]]))
@@ -280,8 +282,7 @@ def test_generation_times_alone_where_no_lengths_are_known(tmp_path):
 
 def test_groups_are_left_out(run):
     path, notes, state = run
-    with tf.Results(path) as results:
-        data = ObservedCycles(results.lineage())
+    data = ObservedCycles(results_lineage(path))
     less = data.without("growth", "sisters")
     assert "growth_per_h" not in less.plan.names and "growth" in data.plan.groups
     kept = [data.plan.names.index(n) for n in less.plan.names]
@@ -297,8 +298,7 @@ def test_groups_are_left_out(run):
 
 def test_what_is_refused(run, tmp_path):
     path, _, _ = run
-    with tf.Results(path) as results:
-        lineage = results.lineage()
+    lineage = results_lineage(path)
     for wrong in (3.0, [], [lineage, None], "cells.csv"):
         with pytest.raises(InputError, match=r"a tf\.Lineage, such as .* or a list of them"):
             ObservedCycles(wrong)
@@ -363,8 +363,7 @@ def test_relatives_that_only_some_colonies_have_are_told():
 
 def test_several_lineages_are_replicates(run):
     path, _, _ = run
-    with tf.Results(path) as results:
-        lineage = results.lineage()
+    lineage = results_lineage(path)
     both = ObservedCycles([lineage, lineage])
     one = ObservedCycles(lineage)
     assert both.colonies == 6 and both.cycles == 2 * one.cycles
@@ -390,8 +389,7 @@ def losses(target, points, **options):
 def test_cycles_beside_other_targets_have_the_same_loss(run):
     """Whose notes have other numbers of columns in each step, alone and in a batch."""
     path, _, _ = run
-    with tf.Results(path) as results:
-        data = ObservedCycles(results.lineage())
+    data = ObservedCycles(results_lineage(path))
     bare = losses(data, (0.2, 0.5, 0.9))
     cells = lambda state: state.counts.double()
     count = Measured({"n": cells}, wanted={"n": 60.0}, spread={"n": 9.0}, time=4.0)
@@ -407,15 +405,33 @@ def test_cycles_beside_other_targets_have_the_same_loss(run):
     np.testing.assert_allclose(losses(bound, (0.2, 0.9)), bare[[0, 2]], rtol=1e-12)
 
 
+def test_residuals_beside_others_add_up_to_the_loss():
+    """Also of cells that are more than a µm long at birth."""
+    founders = tf.Cells.single(2, length=5.0)
+    division = tf.Division(length=tf.Uniform(6.0, 7.0))
+    scene = tf.Scene(tf.Growth(rate=1.2), division, founders=founders, dim=2, dt=0.05)
+    notes, model = [], scene.bind(2, seed=1)
+    state = model.start()
+    births = []
+    one = ObservedCycles(tracks(varied_family()), time=4.0)
+    both = Weighted([(one, 1.0), (one, 2.0)])
+    for _ in range(80):
+        state = model.step(state)
+        notes.append(both.note(state))
+        births += [b.length for b in state.births]
+    assert torch.cat(births).min() > 2.0
+    apart = both.residuals(state, stacked(notes))
+    torch.testing.assert_close((apart * apart).sum(1), both.loss(state, stacked(notes)))
+
+
 def test_cycles_under_conditions(run):
     path, _, _ = run
-    with tf.Results(path) as results:
-        data = ObservedCycles(results.lineage())
+    data = ObservedCycles(results_lineage(path))
     both = Conditions([({"noise": 0.1}, data), ({"noise": 0.2}, data)])
     task = Task(adder, [Parameter("added", 1.2, 2.0)], both, replicates=1, seed=3)
     found = Objective(task).evaluate(np.array([[0.5], [0.9]]))
     assert not found.reasons and found.loss[0] < found.loss[1]
-    grown = simulate_designs(replace_target(task, both), 3)
+    grown = simulate_designs(task, 3)
     assert not grown.reasons and np.isfinite(grown.statistics).all()
     slow = Task(adder, [Parameter("rate", 0.1, 0.2)], both, replicates=1)
     reason = simulate_designs(slow, 1).reasons[0]
@@ -435,19 +451,9 @@ def test_cycles_under_conditions(run):
         Conditions([({"noise": 0.1}, data), ({"noise": 0.2}, short)])
 
 
-def replace_target(task, target):
-    return Task(adder, [Parameter("added", 1.2, 2.0)], target, replicates=1, seed=task.seed)
-
-
-def results_lineage(path):
-    with tf.Results(path) as results:
-        return results.lineage()
-
-
 def test_measures_of_failed_colonies_are_asked_for_once(run, monkeypatch):
     path, _, _ = run
-    with tf.Results(path) as results:
-        data = ObservedCycles(results.lineage())
+    data = ObservedCycles(results_lineage(path))
     asked, measures = [], ObservedCycles.measures
     monkeypatch.setattr(
         ObservedCycles, "measures", lambda *given: asked.append(1) or measures(*given)
@@ -461,8 +467,7 @@ def test_spreads_are_those_of_cycles_that_are_drawn_again(run):
     """A mean varies by the spread of cells over the root of their number; each statistic has a
     least spread of its own units."""
     path, _, _ = run
-    with tf.Results(path) as results:
-        lineage = results.lineage()
+    lineage = results_lineage(path)
     (own, *_) = CellCycles.of_lineage(lineage, 0.5).tables(3)
     drawn = dict(zip(EVERY.names, EVERY.resampled_spread(own), strict=True))
     time = own[:, COLUMNS.index("time")]
