@@ -68,7 +68,7 @@ class Normal(Distribution):
         share = values.inherited.of_rows(state, rows)
         own = ((parents - mean) / torch.where(sd > 0, sd, 1.0)).clamp(-TAIL, TAIL)
         z = share * own + _rest(share) * _standard_normal(state, rows, purpose)
-        return mean + sd * torch.where(z.abs() > TAIL, z.sign() * (2 * TAIL - z.abs()), z)
+        return mean + sd * _folded(z)
 
     def least(self) -> float:
         return float((numbers(self.mean) - 4 * numbers(self.sd)).min())
@@ -117,7 +117,11 @@ class LogNormal(Distribution):
 
 def _standard_normal(state: State, rows: Tensor, purpose: str) -> Tensor:
     """Standard normal draws (M,), the tails beyond 4 folded back inside."""
-    z = state.normal(rows, purpose)[:, 0]
+    return _folded(state.normal(rows, purpose)[:, 0])
+
+
+def _folded(z: Tensor) -> Tensor:
+    """With the tails beyond 4 folded back inside."""
     return torch.where(z.abs() > TAIL, z.sign() * (2 * TAIL - z.abs()).clamp(min=0), z)
 
 

@@ -184,6 +184,10 @@ class _Disc:
     center: np.ndarray
     name = "radius"
 
+    @property
+    def dim(self) -> int:
+        return len(self.center)
+
     def places(self, rng: np.random.Generator, way: np.ndarray) -> np.ndarray:
         """As many as there are ways, (n, dim): unit vectors at random."""
         n, dim = way.shape
@@ -191,8 +195,8 @@ class _Disc:
 
     def size(self, margin: float) -> float:
         """Area or volume, with a margin around."""
-        whole, dim = self.radius + margin, len(self.center)
-        return np.pi * whole**2 if dim == 2 else 4.0 / 3.0 * np.pi * whole**3
+        whole = self.radius + margin
+        return np.pi * whole**2 if self.dim == 2 else 4.0 / 3.0 * np.pi * whole**3
 
     def given(self) -> Any:
         return self.radius
@@ -205,6 +209,10 @@ class _Block:
     low: np.ndarray
     high: np.ndarray
     name = "box"
+
+    @property
+    def dim(self) -> int:
+        return len(self.low)
 
     def places(self, rng: np.random.Generator, way: np.ndarray) -> np.ndarray:
         """As many as there are ways, (n, dim)."""
@@ -242,8 +250,7 @@ def _colony(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions and axes of the cells of a colony, (count, dim) each; length, cell_radius:
     (count,)."""
-    count = len(length)
-    dim = len(place.center if isinstance(place, _Disc) else place.low)
+    count, dim = len(length), place.dim
     position, axis = np.empty((count, dim)), np.empty((count, dim))
     again = np.arange(count)
     for _ in range(ROUNDS):
@@ -258,15 +265,15 @@ def _colony(
     raise checks.input_error(
         place.name, place.given(), "wide enough for the cells",
         f"{count} cells of length {length.mean():g} and radius {wide} µm would fill"
-        f" {_filled(place, dim, length, cell_radius):.0%} of it, and did not find room in"
+        f" {_filled(place, length, cell_radius):.0%} of it, and did not find room in"
         f" {ROUNDS} rounds: give a greater {place.name}, or fewer cells.",
     )  # fmt: skip
 
 
-def _filled(place: _Disc | _Block, dim: int, length: np.ndarray, cell_radius: np.ndarray) -> float:
+def _filled(place: _Disc | _Block, length: np.ndarray, cell_radius: np.ndarray) -> float:
     """The share of the place that cells fill; those at its rim stick out of it."""
     across, around = 2.0 * length * cell_radius, np.pi * cell_radius**2
-    each = across + around if dim == 2 else around * (length + 4.0 / 3.0 * cell_radius)
+    each = across + around if place.dim == 2 else around * (length + 4.0 / 3.0 * cell_radius)
     return float(each.sum()) / place.size(float(cell_radius.max()))
 
 

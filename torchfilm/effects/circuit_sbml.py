@@ -159,18 +159,18 @@ def write_file(
 ) -> None:
     """Write a circuit's equations as an SBML model; see `Circuit.to_sbml`."""
     kinds = [kind for kind in circuit.rates if isinstance(kind, int)]
-    if cell_type is None and kinds:
-        raise checks.InputError(
-            f"{circuit.value_owner()} has rates by cell type: say whose a model is to have, with"
-            f" cell_type={' or '.join(map(str, kinds))}."
-        )
-    if cell_type is None or not kinds:  # rates that all cells have
-        graph, part = circuit.graph, next(iter(circuit.rates.values()))
-    else:
+    if kinds:
+        if cell_type is None:
+            raise checks.InputError(
+                f"{circuit.value_owner()} has rates by cell type: say whose a model is to have,"
+                f" with cell_type={' or '.join(map(str, kinds))}."
+            )
         checks.choice("cell_type", cell_type, tuple(circuit.rates))
         graph, part = circuit.graphs[cell_type], circuit.rates[cell_type]
-    if cell_type is not None and not kinds:
-        _check_type(cell_type, circuit)
+    else:  # rates that all cells have
+        if cell_type is not None:
+            _check_type(cell_type, circuit)
+        graph, part = circuit.graph, next(iter(circuit.rates.values()))
     if circuit.shared:
         raise checks.InputError(
             f"{circuit.value_owner()} shares species of another circuit, so it is no whole model:"
