@@ -230,3 +230,34 @@ def test_a_kymograph_that_would_be_empty_or_wrong_is_refused(tmp_path, options, 
     quantity = options.pop("quantity", "growth_rate")
     with pytest.raises(tf.InputError, match=words):
         pictures.kymograph(tmp_path / "run.h5", quantity, **options)
+
+
+def test_cells_of_a_file_have_the_colours_of_their_founders(tmp_path):
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Division(length=3.0), tf.Mechanics(dim=2), dt=0.1,
+        founders=tf.inoculum(5, radius=10.0),
+    )  # fmt: skip
+    *_, state = tf.simulate(scene, until=1.5, colonies=2, record=tmp_path / "run.h5")
+    with tf.Results(tmp_path / "run.h5") as results:
+        first, last = RecordedFrames(results, [0, -1], colour="founder")
+        tree, (plain,) = results.lineage(), RecordedFrames(results, [-1])
+    assert "founder" not in plain.cells
+    assert len(last.cells["uid"]) >= 4 * len(first.cells["uid"]) == 40
+    for place in range(2):
+        start, end = first.colony(place), last.colony(place)
+        own = {tuple(c): int(uid) for c, uid in zip(start["founder"], start["uid"], strict=True)}
+        assert len(own) == 5
+        for colour, uid in zip(end["founder"], end["uid"], strict=True):
+            assert own[tuple(colour)] == [uid, *tree.ancestors(int(uid), place)][-1]
+    tf.pictures.strip(tmp_path / "run.h5", colour="founder", out=tmp_path / "strip.png")
+    with pytest.raises(tf.InputError, match=r"'founder' .* A state does not know the lines"):
+        tf.show(state, colour="founder")
+
+
+def test_a_quantity_that_is_called_founder_is_drawn_as_it_is(tmp_path):
+    cells = tf.Cells([[0.0, 0.0], [3.0, 0.0]], [[0.0, 1.0]] * 2, 2.0, extra={"founder": [7.5, 3.0]})
+    scene = tf.Scene(tf.Growth(rate=0.5), tf.Mechanics(dim=2), founders=cells, dt=0.1)
+    list(tf.simulate(scene, until=0.1, record=tmp_path / "run.h5"))
+    with tf.Results(tmp_path / "run.h5") as results:
+        (frame,) = RecordedFrames(results, [0], colour="founder")
+    assert frame.cells["founder"].tolist() == [7.5, 3.0]

@@ -33,7 +33,7 @@ class Show:
     """Frames per second of a film."""
     colour: str | None = None
     """The quantity that colours the cells: angle (the default), growth_rate, cell_type, length,
-    yfp, or any other quantity per cell."""
+    yfp, or any other quantity per cell; founder is a colour for each line of descent."""
     channels: list[str] = field(default_factory=list)
     """Instead of --colour: several quantities, each with the colour of its light, as NAME=COLOUR,
     such as --channels cfp=cyan yfp=yellow."""

@@ -112,7 +112,7 @@ class Lineage:
         made.first_seen = np.where(np.isnan(made.born), made.begin, made.born)
         lengths = np.where(np.isnan(founded), np.nan, first["length"])
         made.birth_length = np.concatenate([lengths, births["length"]])
-        at = made._rows(ends["colony_id"], ends["uid"])
+        at = made.rows(ends["colony_id"], ends["uid"])
         made.ended[at] = hours(ends)
         if not np.isin(ends["fate"], np.arange(len(FATES))).all():
             raise InputError(
@@ -122,7 +122,7 @@ class Lineage:
         made.fate[at], made.end_length[at] = np.asarray(FATES)[ends["fate"]], ends["length"]
         living = results.frame(last)
         if "cell_type" in living:
-            alive = made._rows(results.colony_id[living["colony"]], living["uid"])
+            alive = made.rows(results.colony_id[living["colony"]], living["uid"])
             made.cell_type[alive] = living["cell_type"]
         made.cell_type[at] = ends["cell_type"]
         return made
@@ -195,10 +195,6 @@ class Lineage:
     def to_pandas(self) -> Any:
         """A pandas.DataFrame with one row per cell and the columns above."""
         return data_frame({name: getattr(self, name) for name in COLUMNS})
-
-    def born_of(self, colony: np.ndarray, cell: np.ndarray) -> np.ndarray:
-        """When cells (M,) of colonies (M,) were born, h."""
-        return self.born[self._rows(colony, cell)]
 
     def ancestors(self, cell: int, colony: int | None = None) -> list[int]:
         """The cell's mother, her mother, and so on to the founder, or to the first cell that the
@@ -346,8 +342,9 @@ class Lineage:
 
     # --- rows ----------------------------------------------------------------------------
 
-    def _rows(self, colony: np.ndarray, cell: np.ndarray) -> np.ndarray:
-        """The row of each cell; the file has it."""
+    def rows(self, colony: np.ndarray, cell: np.ndarray) -> np.ndarray:
+        """The rows of the cells (M,) of a frame, of the colonies with these ids (M,). Raises
+        InputError where the file lacks one."""
         wanted = _pair(colony, cell)
         at = np.searchsorted(self._keys, wanted).clip(max=len(self._keys) - 1)
         if len(wanted) and not (len(self._keys) and (self._keys[at] == wanted).all()):

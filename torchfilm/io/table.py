@@ -65,7 +65,7 @@ class Tables:
             signals = {name: x[rows] for name, x in signals.items()}
         place, time = found["colony"], float(results.times[k])
         found |= {"colony": results.colony_id[place]}
-        born = self.lineage.born_of(found["colony"], found["uid"])
+        born = self.lineage.born[self.lineage.rows(found["colony"], found["uid"])]
         columns = {
             "frame": np.full(len(place), k),
             **_of_cells(time, found, self.internals),

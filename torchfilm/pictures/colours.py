@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from torchfilm.pictures.frames import Frame, unit_of
+from torchfilm.pictures.categories import KINDS, MOST_TYPES, colours_of_kinds
+from torchfilm.pictures.frames import FOUNDER, Frame, unit_of
 from torchfilm.pictures.shapes import VIEWS
 from torchfilm.state import OUTSIDE
 from torchfilm.tools import checks
@@ -20,13 +21,7 @@ VECTORS = ("position", "axis")  # three values of a cell that are no colour
 CELLS, MEAN = "cells", "mean"
 # The darkest cell colour is not black, so that cells are visible on black. Missing values are grey.
 FLOOR, NO_VALUE = 0.14, (0.55, 0.55, 0.55, 1.0)
-# An integer quantity with at most this many values is a category. These are the colours of 0, 1, …
-# (of Okabe and Ito, and one of Tol, distinct for colour-blind readers): a type keeps its colour
-# where others die. Types of cells are categories up to MOST_TYPES.
-KINDS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#661100")
-TYPES, MOST_TYPES = "cell_type", 24
-GOLDEN = 0.618034  # of a turn, from one hue to the next
-APART = 0.45  # the least distance between two categories, as red, green and blue
+TYPES = "cell_type"
 # Angles of 0, 15, … 165°. In CIELAB L = 58 + 22 sin t, a = 25 sin t and b = −35 cos t, t twice the
 # angle: lightness and blue–yellow tell directions apart without red and green, where a circle of
 # hues has pairs that look alike.
@@ -45,7 +40,7 @@ Limits = Mapping[str, tuple[float, float]]
 # What tables have of each cell, and no frame holds.
 NOT_DRAWN = dict.fromkeys(
     ("age", "born", "volume"), "Tables and ParaView have it (to_pandas, export); pictures do not."
-)
+) | {FOUNDER: "A state does not know the lines of descent: draw a results file."}
 
 
 @dataclass(frozen=True)
@@ -298,7 +293,7 @@ def scale_of(
             name,
             label,
             unit,
-            ListedColormap(_colours_of_kinds(sorted(seen.kinds), name == TYPES)),
+            ListedColormap(colours_of_kinds(sorted(seen.kinds), name == TYPES)),
             (0.0, 1.0),
             kinds=tuple(sorted(seen.kinds)),
         )
@@ -314,32 +309,6 @@ def scale_of(
 def range_of(name: str) -> ValueRange:
     """The range of a quantity of which nothing is known yet."""
     return ValueRange(MOST_TYPES if name == TYPES else len(KINDS))
-
-
-def _colours_of_kinds(kinds: Sequence[int], keep: bool = False) -> list[Any]:
-    """The colours of categories, by their numbers; beyond the list hues that are apart from those
-    before. keep: each number has one colour, whatever else there is."""
-    if keep:
-        known = _colours_of_kinds(range(MOST_TYPES))
-        each = (known[k] if 0 <= k < MOST_TYPES else _colour_of_kind(k, 0) for k in kinds)
-        return list(each)
-    found: list[Any] = []
-    for kind in kinds:
-        made = [_colour_of_kind(kind, k) for k in range(12)]
-        far = [min((math.dist(c, x) for x in found), default=1.0) for c in made]
-        found.append(next((c for c, x in zip(made, far, strict=True) if x >= APART),
-                          made[int(np.argmax(far))]))  # fmt: skip
-    return found
-
-
-def _colour_of_kind(kind: int, turns: int) -> tuple[float, ...]:
-    """The colour of a category, by its number alone, or another one, so many hues further."""
-    from matplotlib.colors import hsv_to_rgb, to_rgb
-
-    if 0 <= kind < len(KINDS) and not turns:
-        return to_rgb(KINDS[kind])
-    hue = (kind * GOLDEN + turns / 12) % 1.0
-    return tuple(hsv_to_rgb((hue, 0.6, (0.9, 0.6)[kind % 2])).tolist())
 
 
 def _wide_enough(low: float, high: float, share: float) -> tuple[float, float]:

@@ -54,11 +54,11 @@ def show(
     with the `scene` whose walls are drawn: a state does not know them; or a `Frame`.
 
     colour: the quantity that colours the cells: "angle", the direction of their axes, or any
-    quantity per cell by name. The default is the type of the cells where there are several, else
-    the first species of a circuit, else the angle. channels: instead of colour, several quantities
-    at once as in fluorescence microscopy, each with the colour of its light; the colours add up:
-    {"cfp": "cyan", "yfp": "yellow"}. background: a signal of the medium, white lowest and black
-    highest.
+    quantity per cell by name; of a file also "founder", a colour for each line of descent. The
+    default is the type of the cells where there are several, else the first species of a circuit,
+    else the angle. channels: instead of colour, several quantities at once as in fluorescence
+    microscopy, each with the colour of its light; the colours add up: {"cfp": "cyan", "yfp":
+    "yellow"}. background: a signal of the medium, white lowest and black highest.
 
     values: quantities of your own of a state, by name, one number for each cell: `values={"real
     growth (1/h)": tf.measure.growth_rates(state, earlier)}`; or three, its red, green and blue. The
@@ -89,7 +89,7 @@ def show(
         rule = "left out for results: they are of the cells of one state"
         raise checks.input_error("values", list(values), rule)
     else:
-        shown, heading = _recorded_frame(what, scene, frame, background, out)
+        shown, heading = _recorded_frame(what, scene, frame, style, out)
     return Picture(_one_time(shown, heading, style, colonies, most, title, dpi), out)
 
 
@@ -166,14 +166,14 @@ def _with(values: Mapping[str, Any] | None, frame: Frame) -> Frame:
 
 
 def _recorded_frame(
-    what: object, scene: Scene | None, frame: int, background: str | None, out: str | Path | None
+    what: object, scene: Scene | None, frame: int, style: PlotStyle, out: str | Path | None
 ) -> tuple[Frame, str]:
     """A frame of a results file, and the words before the time in its title."""
     if scene is not None:
         raise checks.InputError("show got results and a scene: results have their own walls.")
     with opened(what) as results:
         check_not_results(results.path, out)
-        recorded = RecordedFrames(results, [frame], background)
+        recorded = RecordedFrames(results, [frame], style.background, style.colour)
         return recorded[0], f"{recorded.title}, "
 
 
@@ -206,7 +206,8 @@ def strip(
     style = PlotStyle(colour, channels, background, limits, view, section, whole)
     with opened(what) as results:
         check_not_results(results.path, out)
-        recorded = RecordedFrames(results, choose_frames(results.times, times, frames), background)
+        chosen = choose_frames(results.times, times, frames)
+        recorded = RecordedFrames(results, chosen, background, colour)
         places, more = choose_colonies(
             recorded.shown(style.shows_box), results.colony_id, colonies, 4
         )

@@ -12,13 +12,16 @@ import numpy as np
 
 from torchfilm.io.identity import walls_of
 from torchfilm.io.layout import OBSTACLES
+from torchfilm.io.lineage import Lineage
 from torchfilm.io.parameters import column_names
 from torchfilm.io.results import Results
+from torchfilm.pictures.categories import colours_by_number
 from torchfilm.scene import Scene
 from torchfilm.state import CELL, PER_CELL, State
 from torchfilm.tools import checks
 
 UNITS = {"length": "µm", "radius": "µm"}
+FOUNDER = "founder"  # a colour for each line of descent; only a file knows the lines
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,14 +115,18 @@ def _parted(values: np.ndarray, shapes: np.ndarray) -> list[np.ndarray]:
 
 
 class RecordedFrames(Sequence[Frame]):
-    """Some frames of a results file, each read on access, with one signal or none."""
+    """Some frames of a results file, each read on access, with one signal or none. colour: of the
+    cells; they have their founders' colours where it is "founder"."""
 
-    def __init__(self, results: Results, places: Sequence[int], signal: str | None = None):
-        self.results, self.places, self.signal = (
-            results,
-            [results._index(k) for k in places],
-            signal,
-        )
+    def __init__(
+        self,
+        results: Results,
+        places: Sequence[int],
+        signal: str | None = None,
+        colour: str | None = None,
+    ):
+        self.results, self.signal, self.colour = results, signal, colour
+        self.places = [results._index(k) for k in places]
         declared = json.loads(results.attributes["declared"])
         self.units, self.walls = {name: entry[1] for name, entry in declared.items()}, results.walls
         self.faces = results.periodic
@@ -136,9 +143,12 @@ class RecordedFrames(Sequence[Frame]):
 
     def __getitem__(self, k):
         if isinstance(k, slice):
-            return RecordedFrames(self.results, self.places[k], self.signal)
+            return RecordedFrames(self.results, self.places[k], self.signal, self.colour)
         results, place = self.results, self.places[k]
         cells, ids, time = results.frame(place), results.colony_id, float(results.times[place])
+        if self.colour == FOUNDER and FOUNDER not in cells:
+            rows = self._lineage.rows(ids[cells["colony"]], cells["uid"])
+            cells = {**cells, FOUNDER: colours_by_number(self._lineage.founder[rows])}
         if not results.signal_names:
             return Frame(
                 cells,
@@ -169,6 +179,10 @@ class RecordedFrames(Sequence[Frame]):
             _named(results.parameters(place)),
             _solid(self._obstacles, shape),
         )
+
+    @cached_property
+    def _lineage(self) -> Lineage:
+        return self.results.lineage()
 
     @cached_property
     def _obstacles(self) -> np.ndarray | None:

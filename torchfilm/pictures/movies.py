@@ -71,7 +71,8 @@ def movie(
     with opened(what) as results:
         check_not_results(results.path, out)
         last = len(results) - 1
-        frames = RecordedFrames(results, sorted({*range(0, last + 1, every), last}), background)
+        drawn = sorted({*range(0, last + 1, every), last})
+        frames = RecordedFrames(results, drawn, background, colour)
         places, more = choose_colonies(
             frames.shown(style.shows_box), results.colony_id, colonies, 9
         )

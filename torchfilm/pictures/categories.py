@@ -1,0 +1,49 @@
+"""The colours of categories."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+# An integer quantity with at most this many values is a category. These are the colours of 0, 1, …
+# (of Okabe and Ito, and one of Tol, distinct for colour-blind readers): a type keeps its colour
+# where others die. Types of cells are categories up to MOST_TYPES.
+KINDS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#661100")
+MOST_TYPES = 24
+GOLDEN = 0.618034  # of a turn, from one hue to the next
+APART = 0.45  # the least distance between two categories, as red, green and blue
+
+
+def colours_of_kinds(kinds: Sequence[int], keep: bool = False) -> list[Any]:
+    """The colours of categories, by their numbers; beyond the list hues that are apart from those
+    before. keep: each number has one colour, whatever else there is."""
+    if keep:
+        known = colours_of_kinds(range(MOST_TYPES))
+        each = (known[k] if 0 <= k < MOST_TYPES else colour_of_kind(k, 0) for k in kinds)
+        return list(each)
+    found: list[Any] = []
+    for kind in kinds:
+        made = [colour_of_kind(kind, k) for k in range(12)]
+        far = [min((math.dist(c, x) for x in found), default=1.0) for c in made]
+        found.append(next((c for c, x in zip(made, far, strict=True) if x >= APART),
+                          made[int(np.argmax(far))]))  # fmt: skip
+    return found
+
+
+def colours_by_number(numbers: np.ndarray) -> np.ndarray:
+    """Red, green and blue (N, 3) of any integers (N,), by each of them alone."""
+    kinds, of = np.unique(numbers, return_inverse=True)
+    return np.array(colours_of_kinds(kinds.tolist(), keep=True)).reshape(-1, 3)[of]
+
+
+def colour_of_kind(kind: int, turns: int) -> tuple[float, ...]:
+    """The colour of a category, by its number alone, or another one, so many hues further."""
+    from matplotlib.colors import hsv_to_rgb, to_rgb
+
+    if 0 <= kind < len(KINDS) and not turns:
+        return to_rgb(KINDS[kind])
+    hue = (kind * GOLDEN + turns / 12) % 1.0
+    return tuple(hsv_to_rgb((hue, 0.6, (0.9, 0.6)[kind % 2])).tolist())
