@@ -103,11 +103,13 @@ def _recording(
 class TriedScene:
     """What binding a scene once has found. first: its first state. why_regrown: the reason why
     colonies cannot follow recorded growth, or "". why_endless: the reason why no run can reach
-    `cells` cells, or ""."""
+    `cells` cells, or "". by_id: the title of the first effect that reads the ids of colonies, or
+    ""."""
 
     first: tf.State
     why_regrown: str
     why_endless: str
+    by_id: str
 
 
 def try_scene(
@@ -124,7 +126,9 @@ def try_scene(
     model = _bind(scene, colonies, seed, dtype, device)
     first = model.start()
     why = model.why_not_replayable if replay else REPLAY_IS_OFF
-    return TriedScene(first, why, "" if cells is None else _why_endless(model, first, cells))
+    endless = "" if cells is None else _why_endless(model, first, cells)
+    by_id = next((effect.title for effect in model.effects if "colony" in effect.reads()), "")
+    return TriedScene(first, why, endless, by_id)
 
 
 def _why_endless(model: tf.Model, first: tf.State, cells: int) -> str:

@@ -135,7 +135,8 @@ class TriedScenes:
     founders and the code of functions. why_regrown: the reason why colonies cannot follow recorded
     growth, or "". why_rough: the reason why losses have no exact derivatives, with one option of a
     choice at least, or "". stochastic: whether circuits count molecules one by one. idle:
-    parameters on which nothing in the scene depends.
+    parameters on which nothing in the scene depends. by_id: the title of an effect that reads the
+    ids of colonies, or "".
     """
 
     founders: int
@@ -148,6 +149,7 @@ class TriedScenes:
     why_rough: str
     stochastic: bool
     idle: tuple[str, ...]
+    by_id: str
 
 
 def try_scenes(
@@ -168,7 +170,7 @@ def try_scenes(
     """
     trials = _trial_values(family.space)
     made_of: dict[int, Any] = {}  # by the number of the trial
-    endless, unfit, rough, growth = [], [], [], []
+    endless, unfit, rough, growth, by_id = [], [], [], [], ""
     example: tf.Scene | None = None
     stochastic = False
     run: dict[str, Any] = {"seed": seed, "dtype": dtype, "replay": replay}
@@ -194,6 +196,7 @@ def try_scenes(
         made_of[k] = scene.effects, scene.drawn_from
         stochastic |= _is_stochastic(scene)
         endless.append(tried.why_endless)
+        by_id = by_id or tried.by_id
         growth.append(_free_growth(scene, tried.first))
         rough.append(why_rough(scene, tried.why_regrown) or target.why_rough(tried.first))
     # one design that does not grow is scored as such; a search in which none grows is a mistake
@@ -214,6 +217,7 @@ def try_scenes(
         why_regrown=why_regrown,
         why_rough=next(filter(None, rough), ""),
         stochastic=stochastic,
+        by_id=by_id,
     )
 
 

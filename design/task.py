@@ -141,6 +141,13 @@ class Task(TaskOptions):
                 hint = _fitting_words(self.target.times, dt)
                 raise checks.input_error("dt", dt, rule, hint)
         self._set(fixed=fixed, until=until, dt=dt, family=family, tried=tried)
+        if tried.by_id:
+            checks.warn(
+                f"the scene's {tried.by_id} reads the ids of colonies. In a search these are places"
+                " in a batch, so that what depends on them depends on which designs are grown"
+                " together. Let what differs between colonies be a parameter of the scene"
+                ' function, such as Choice("mask", (0, 1), per_colony=True), read as p.mask.'
+            )
         if until is not None and self.cells is None and tried.growth * until > math.log(TOO_MANY):
             power = tried.growth * until / math.log(10.0)
             words = f"at {tried.growth:.3g}/h, a cell becomes 10^{power:.0f} cells by then"

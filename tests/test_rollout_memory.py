@@ -174,6 +174,43 @@ def test_weights_that_change_before_the_gradient_are_refused():
         end.a.sum().backward()
 
 
+@pytest.mark.parametrize("what", ["a global", "a tensor", "a memory", "a memory in the graph"])
+def test_what_a_rule_reads_must_not_change_before_the_gradient(what):
+    light, tensor = [torch.ones((), dtype=F64)], torch.ones((), dtype=F64)
+
+    def shine(cells):
+        if what.startswith("a memory"):  # of a controller
+            found = light[0] + 0.1 * (1 - cells.a).mean()
+            light[0] = found if what.endswith("graph") else found.detach()
+        cells.light = torch.ones_like(cells.a) * (tensor if what == "a tensor" else light[0])
+
+    make = torch.tensor(4.0, dtype=F64, requires_grad=True)
+    model = tf.Scene(
+        tf.Rules(shine, variables={"light": 0.0}),
+        tf.Circuit(lambda u, s, p, cell: {"a": p.k * cell.light - u.a}, species="a", k=make),
+        dim=2, dt=0.1,
+    ).bind(dtype=F64)  # fmt: skip
+    model.start()
+    light[0] = torch.ones((), dtype=F64)
+    end = tf.rollout(model, until=0.6, segment=2)
+    if what == "a global":
+        light[0] = torch.zeros((), dtype=F64)
+    elif what == "a tensor":
+        tensor.fill_(0.0)
+    with pytest.raises(tf.InputError, match=r"does its steps again, and the step to 0.5 h ended"):
+        end.a.sum().backward()
+
+
+def test_steps_that_repeat_give_their_gradient_twice():
+    make = torch.tensor(4.0, dtype=F64, requires_grad=True)
+    circuit = tf.Circuit(lambda u, s, p, cell: {"a": p.k - u.a}, species="a", k=make)
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.0), circuit, dim=2, dt=0.1)
+    end = tf.rollout(scene, until=2.0, segment=3)
+    assert end.cells > 1
+    first, second = (torch.autograd.grad(end.a.sum(), make, retain_graph=True) for _ in range(2))
+    assert torch.equal(first[0], second[0]) and float(first[0]) > 0
+
+
 # --- where a first state comes from ---------------------------------------------------------------
 
 

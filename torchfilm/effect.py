@@ -44,7 +44,7 @@ LYSIS, DIVISION, REMOVAL, SLOUGHING = 70, 80, 90, 92
 
 GEOMETRY = ("position", "axis", "length", "radius")
 # Names that every state has and an effect may read or write beside declared fields.
-BUILT_IN = (*GEOMETRY, "cells")
+BUILT_IN = (*GEOMETRY, "cells", "colony")
 
 
 @dataclass(frozen=True)
@@ -152,9 +152,9 @@ class Effect(metaclass=checks.KnownKeywords):
         return ()
 
     def reads(self) -> Sequence[str]:
-        """What `step` reads: "position", "axis", "length", "radius", "cells" (how many, which) or
-        fields. Each must exist; what is used only where a scene has it, `BoundEffect.reads` adds.
-        """
+        """What `step` reads: "position", "axis", "length", "radius", "cells" (how many, which),
+        "colony" (the ids of colonies) or fields. Each must exist; what is used only where a scene
+        has it, `BoundEffect.reads` adds."""
         return ()
 
     def needs(self) -> Sequence[str]:

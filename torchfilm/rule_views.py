@@ -40,7 +40,7 @@ MEANS = {
     "area": ("length", "radius"),
     "uid": ("cells",),
     "parent": ("cells",),
-    "colony": ("cells",),
+    "colony": ("cells", "colony"),
 }
 IDENTITY = ("uid", "parent", "colony")
 # fields that only an effect acts on

@@ -25,7 +25,7 @@ from torchfilm.loop import (
 from torchfilm.model import Model
 from torchfilm.replay import Replay
 from torchfilm.scene import Scene
-from torchfilm.state import State
+from torchfilm.state import PER_CELL, PER_COLONY, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.hashing import trained
 from torchfilm.tools.progress import RunBar, wanted
@@ -213,7 +213,7 @@ def rollout(
     kept, and the steps between are computed again on the way back (torch.utils.checkpoint), so that
     memory grows with the number of segments and not of steps; None keeps all, and saves the time.
     So nothing that the scene reads may change before the gradient is taken: call `backward` before
-    the step of an optimiser.
+    the step of an optimiser. Steps that do not repeat then are an error.
     scene: or a model, or a `Replay`, whose steps are as long as its recording's. state: from which
     to start; by default the first. Failures are raised as in `simulate`.
     """
@@ -234,10 +234,10 @@ def rollout(
     model.check_step(dt)
     monitors = [partial(handle_failures, on_failure="raise")]
 
-    def steps_from(begin: State, steps: int) -> State:
+    def steps_from(begin: State, steps: int, *more: Monitor) -> State:
         last_step, end = begin.step + steps, begin
         stop = lambda s: s.step >= last_step
-        for later in advance(step, begin, stop=stop, monitors=monitors):
+        for later in advance(step, begin, stop=stop, monitors=[*monitors, *more]):
             end = later
         return end
 
@@ -254,12 +254,26 @@ def rollout(
                     " rollout began, and the gradient does its steps again: call backward before"
                     " the step of an optimiser, or give rollout segment=None."
                 )
-            return steps_from(begin, steps)
+            return steps_from(begin, steps, partial(_check_repeats, kept))
 
     while state.step < last:
         count = min(segment, last - state.step)
         state = checkpoint(segment_of, Segment(), state, count, use_reentrant=False)
     return state
+
+
+def _check_repeats(kept: Segment, state: State) -> None:
+    """Raise InputError where a step that is done again ends otherwise."""
+    if state.device.type != "cpu" and not torch.are_deterministic_algorithms_enabled():
+        return  # sums may differ in their last bits
+    columns = (getattr(state, name) for name in (*PER_CELL, *PER_COLONY))
+    if not kept.repeats([*columns, *state.fields.values()]):
+        raise checks.InputError(
+            f"the gradient of rollout does its steps again, and the step to {state.time:g} h ended"
+            " otherwise than before. So something that the scene reads has changed since, such as"
+            " a global of a rule or a controller's memory. Take the gradient before it changes,"
+            " keep a memory in variables of the cells, or give rollout segment=None."
+        )
 
 
 def _bound(scene: Scene | Model, state: State | None, batch: dict[str, Any]) -> Model:

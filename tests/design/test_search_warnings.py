@@ -111,3 +111,48 @@ def test_a_parameter_on_which_nothing_depends_is_told(capfd):
     assert "depends on" not in run(k)
     either = lambda k=1.0, typo=1.0, kind="a": lit(k if kind == "a" else typo)
     assert "depends on" not in run(k, typo, Choice("kind", ["a", "b"]), scene=either)
+
+
+LIGHT = torch.tensor([0.0, 1.0])
+
+
+def lit_by_place(k=1.0) -> tf.Scene:
+    rates = lambda u, s, p, cell: {"m": p.k * LIGHT[cell.colony.long() % 2] - u.m}
+    return tf.Scene(tf.Circuit(rates, species="m", k=k), founders=tf.Cells.single(2), dt=0.1)
+
+
+def ruled_by_place(k=1.0) -> tf.Scene:
+    def shine(cells):
+        cells.light = LIGHT[cells.colony % 2]
+
+    rates = lambda u, s, p, cell: {"m": p.k * cell.light - u.m}
+    return tf.Scene(
+        tf.Rules(shine, variables={"light": 0.0}), tf.Circuit(rates, species="m", k=k),
+        founders=tf.Cells.single(2), dt=0.1,
+    )  # fmt: skip
+
+
+def lit_by_choice(k=1.0, mask=0) -> tf.Scene:
+    rates = lambda u, s, p, cell: {"m": p.k * LIGHT[p.mask.long()] - u.m}
+    circuit = tf.Circuit(rates, species="m", k=k, mask=mask)
+    return tf.Scene(circuit, founders=tf.Cells.single(2), dt=0.1)
+
+
+@pytest.mark.parametrize(("scene", "title"), [(lit_by_place, "circuit"), (ruled_by_place, "rules")])
+def test_losses_that_depend_on_the_place_in_a_batch_are_warned_of(scene, title):
+    target = Measured({"most": most}, {"most": 0.5}, {"most": 0.1})
+    with pytest.warns(UserWarning, match=f"the scene's {title} reads the ids of colonies"):
+        Search(scene, [Parameter("k", 1.0, 1.001)], target, until=0.5, replicates=1)
+
+
+def test_a_mask_that_is_a_choice_gives_alike_designs_one_loss():
+    target = Measured({"most": most}, {"most": 0.5}, {"most": 0.1})
+    masks = Choice("mask", (0, 1), per_colony=True)
+    search = Search(
+        lit_by_choice, [Parameter("k", 1.0, 1.0 + 1e-9), masks], target, until=0.5, replicates=1,
+        method=Sobol(batch=8), seed=0, finals=None,
+    )  # fmt: skip
+    search.run(colonies=8, progress=False)
+    (batch,) = search.study.entries
+    each = zip(batch.values, batch.loss.tolist(), strict=True)
+    assert len({(values["mask"], round(loss, 6)) for values, loss in each}) == 2 < len(batch.loss)

@@ -49,6 +49,7 @@ GEOMETRY = {
     "x": ("position",),
     "y": ("position",),
     "z": ("position",),
+    "colony": ("colony",),
 }
 
 
