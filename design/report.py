@@ -17,7 +17,7 @@ from design.study import Study
 from design.targets.base import Target, inner_targets
 from design.targets.goals import Constrained, Goals
 from design.targets.lasting import Lasting
-from design.targets.measured import extinct_words
+from design.targets.measured import extinct_words, has_mean_with_error
 from design.task import Task
 from design.trivial import EVERY_SECOND, trivial_losses
 
@@ -326,8 +326,12 @@ def _misses(target: Target, best: ReportedDesign) -> str:
         return ""
     words = ", ".join(f"{n} by {apart[n]:.1f} spreads" for n in worst)
     like = (
-        "colonies that grew as the observed ones did have a loss of about 1 (up to 5 where one or"
-        " two were observed, which do not tell how much colonies differ). "
+        "a colony is farther from a mean over several than the error of that mean, so that losses"
+        " are above 1 also where the mean fits; give the numbers of each colony"
+        " (Measured.of_colonies, or values by time and colony). "
+        if has_mean_with_error(target)
+        else "colonies that grew as the observed ones did have a loss of about 1 (up to 5 where one"
+        " or two were observed, which do not tell how much colonies differ). "
     )
     return (
         f"{like if target.evidence else ''}The best design is off most in {words}. Search longer,"

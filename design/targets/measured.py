@@ -7,7 +7,9 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,6 +26,9 @@ from design.targets.base import (
 from torchfilm import checks
 
 Measure = Callable[[tf.State], Tensor]
+# colonies from which on their numbers say how much they differ, and the least spread then, relative
+# to the greatest number
+ENOUGH, FINEST = 3, 0.01
 TRIED = 4  # random levels, to see whether a measure depends on them
 NO_CELLS = "no cells remain"  # why a colony without cells has failed
 
@@ -50,9 +55,13 @@ class Measured(Target):
     unless it does not depend on levels, as the volume of a colony does not.
 
     time: h, when the values were measured, at which colonies then end. Measures of several times
-    make a course: `ObservedCourse([Measured(…, time=1.0), Measured(…, time=2.0)])`. colonies: over
-    how many the values are means, for `infer`, which averages over as many simulated ones; spread
-    is then the error of the mean, beyond what differs between colonies.
+    make a course: `ObservedCourse([Measured(…, time=1.0), Measured(…, time=2.0)])`. Of several
+    colonies each with its number, `Measured.of_colonies` makes the target.
+
+    For `infer`: colonies: over how many the values are means; it averages over as many simulated
+    ones. error: by name, the standard error of measurement of the values, which simulations do not
+    have, 0 for exact counts; spread is then how much single colonies differ. By default the spread
+    is that error, beyond what differs between colonies.
     """
 
     failed = WORST
@@ -67,6 +76,7 @@ class Measured(Target):
     time: float | None = None
     # without effect on losses: studies do not depend on it
     colonies: int = field(default=1, repr=False)
+    error: Mapping[str, float] | None = field(default=None, repr=False)
     _warned: bool = field(default=False, init=False, repr=False, compare=False)
 
     @property
@@ -97,6 +107,46 @@ class Measured(Target):
         object.__setattr__(self, "wanted", ranges)
         for name in self.functions:
             checks.number(f"Measured.spread[{name!r}]", self.spread[name], above=0.0)
+        if self.error is not None:
+            if not isinstance(self.error, Mapping) or self.error.keys() != self.functions.keys():
+                rule = f"None, or a dict with the names {', '.join(map(repr, self.functions))}"
+                raise checks.input_error("Measured.error", self.error, rule)
+            for name, error in self.error.items():
+                checks.number(f"Measured.error[{name!r}]", error, least=0.0)
+
+    @staticmethod
+    @checks.known_keywords
+    def of_colonies(
+        functions: Mapping[str, Measure],
+        values: Mapping[str, Any],
+        *,
+        error: Mapping[str, float] | None = None,
+        extinct: bool = False,
+        smooth: bool = False,
+        time: float | None = None,
+    ) -> Measured:
+        """Numbers of each of several observed colonies:
+
+            Measured.of_colonies({"donors": count_of(0)}, {"donors": [31, 25, 40, 28]}, time=3.0)
+
+        values: by name, as many numbers as colonies, three at least. Wanted is their mean, and the
+        spread is their standard deviation, or 1 % of the greatest number, so that a colony like
+        them has a loss of about 1. error: of measurement, of the mean; by default 0, as of counts.
+        The rest is as of `Measured`. Raises InputError for other names and numbers.
+        """
+        found = {}
+        for name, numbers in checked_columns("Measured.of_colonies: values", values, functions):
+            label = f"Measured.of_colonies: values[{name!r}]"
+            found[name] = mean_and_spread(label, np.asarray(checks.vector(label, numbers))[None])
+        counts = {name: len(values[name]) for name in found}
+        if len(set(counts.values())) > 1:
+            rule = "as many numbers of each, one for each colony"
+            raise checks.input_error("Measured.of_colonies: values", counts, rule)
+        wanted, spread = ({name: float(x[k][0]) for name, x in found.items()} for k in (0, 1))
+        return Measured(
+            functions, wanted, spread, extinct=extinct, smooth=smooth, time=time,
+            colonies=next(iter(counts.values())), error=error or dict.fromkeys(functions, 0.0),
+        )  # fmt: skip
 
     def check(self, state: tf.State) -> None:
         try:
@@ -199,6 +249,31 @@ class Measured(Target):
         return ", ".join(f"{name} {words}" for name, words in self.bounds.items())
 
 
+def checked_columns(
+    label: str, given: Any, functions: Mapping[str, Measure]
+) -> list[tuple[str, Any]]:
+    """What is given for each measure, by its name. Raises InputError for other names."""
+    if not hasattr(given, "keys") or set(given.keys()) != set(functions):
+        rule = f"numbers by the names {', '.join(map(repr, functions))}"
+        raise checks.input_error(label, given, rule)
+    return [(name, given[name]) for name in functions]
+
+
+def mean_and_spread(label: str, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The means of a measure over colonies, (T,), of its numbers at each time (T, C), and how much
+    colonies differ, (T,)."""
+    if rows.shape[1] < ENOUGH:
+        rule = (
+            f"numbers of {ENOUGH} colonies at least, since fewer do not tell how much they differ"
+        )
+        raise checks.input_error(label, rows.tolist(), rule, "Give Measured their mean and spread.")
+    least = FINEST * np.nanmax(np.abs(rows))
+    if not least > 0:
+        hint = "Give Measured the spread, or leave it out."
+        raise checks.input_error(label, rows.tolist(), "numbers of which one is not 0", hint)
+    return rows.mean(1), np.maximum(rows.std(1, ddof=1), least)
+
+
 def _range(name: str, given: object) -> tuple[float, float]:
     label = f"Measured.wanted[{name!r}]"
     if not isinstance(given, tuple | list):
@@ -248,6 +323,12 @@ def _depends_on_levels(measure: Measure, state: tf.State) -> bool:
             return not all(bool(x.all()) for x in same)
     except Exception:  # of a function that takes no such levels
         return True
+
+
+def has_mean_with_error(target: object) -> bool:
+    """Whether the spread of a measure is the error of a mean over several colonies."""
+    mean = isinstance(target, Measured) and target.colonies > 1 and target.error is None
+    return mean or any(map(has_mean_with_error, inner_targets(target)))
 
 
 def extinct_words(target: Target, reasons: Iterable[str]) -> list[str]:

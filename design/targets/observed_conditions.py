@@ -137,12 +137,13 @@ def grown(observed: Observed) -> Target:
 
 def standard_errors(observed: Observed, replicates: int | None = None) -> np.ndarray:
     """Of the values, (K,): the spread of cells is that of single colonies, and each value a mean
-    over some; that of measured numbers is their error. replicates: of a simulation, for the root of
-    half the squares of its error and that of the value."""
+    over some; that of measured numbers is their error, unless they have one beside it. replicates:
+    of a simulation, for the root of half the squares of its error and that of the value."""
     spread, seen = np.array(observed.spread), np.array(_colonies(observed))
-    alone = np.array([error > 0 for error in errors(observed)])  # which simulations have, too
+    measured = np.array(errors(observed))  # which simulations have, too
     grown = seen if replicates is None else np.array(averaged(observed, replicates))
-    return np.where(alone, spread, spread * np.sqrt(0.5 / seen + 0.5 / grown))
+    differ = np.where(measured == spread, 0.0, spread * np.sqrt(0.5 / seen + 0.5 / grown))
+    return np.hypot(measured, differ)
 
 
 def averaged(observed: Observed, replicates: int) -> list[int]:

@@ -185,7 +185,8 @@ class ObservedCourse(Observed):
         *,
         times: Sequence[float],
         values: Mapping[str, Any],
-        spread: Mapping[str, Any],
+        spread: Mapping[str, Any] | None = None,
+        error: Mapping[str, Any] | None = None,
         extinct: bool = False,
         smooth: bool = False,
         colonies: int = 1,
@@ -195,14 +196,13 @@ class ObservedCourse(Observed):
             ObservedCourse.of_measures({"od": volume}, times=(1, 2, 3),
                                        values={"od": (0.1, 0.2, nan)}, spread={"od": 0.01})
 
-        functions, extinct, smooth, colonies: as of `Measured`. times: h, in their order. values: by
-        name, as many numbers as times, NaN where one is missing; a pandas.DataFrame will do.
+        functions, error, extinct, smooth, colonies: as of `Measured`. times: h, in their order.
+        values: by name, as many numbers as times, NaN where one is missing; a pandas.DataFrame will
+        do; or numbers by time and colony, (T, C), as of `Measured.of_colonies`, without a spread.
         spread: by name, a standard error above 0, or one for each time. Raises InputError for other
-        names, lengths or times, and where fewer than two times have a value.
-        """
-        return ObservedCourse(
-            measured_frames(functions, times, values, spread, extinct, smooth, colonies)
-        )
+        names, lengths or times, and where fewer than two times have a value."""
+        known = functions, times, values, spread, error
+        return ObservedCourse(measured_frames(*known, extinct, smooth, colonies))
 
     @staticmethod
     @checks.known_keywords

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 import torchfilm as tf
-from design.targets.measured import Measured
+from design.targets.measured import Measured, checked_columns, mean_and_spread
 from design.targets.observed import Observed
 from torchfilm import checks
+
+MEASURES = "ObservedCourse.of_measures"
 
 
 def mask_frames(
@@ -67,40 +69,92 @@ def _check_count(what: str, given: Any, count: int) -> None:
 
 
 def measured_frames(
-    functions: Any, times: Any, values: Any, spread: Any, extinct: bool, smooth: bool, colonies: int
+    functions: Any,
+    times: Any,
+    values: Any,
+    spread: Any,
+    error: Any,
+    extinct: bool,
+    smooth: bool,
+    colonies: int,
 ) -> list[Measured]:
     """The measures at each time, of those that are known there."""
-    call = "ObservedCourse.of_measures"
     rule = "a dict of functions by name, such as {'od': total_volume}"
     if not isinstance(functions, Mapping) or not functions:
-        raise checks.input_error(f"{call}: functions", functions, rule)
-    moments = checks.vector(f"{call}: times", times)
+        raise checks.input_error(f"{MEASURES}: functions", functions, rule)
+    moments = checks.vector(f"{MEASURES}: times", times)
     if min(moments, default=1.0) <= 0.0:
         hint = "Leave such readings out: a scene's founders and `initial=` say how colonies begin."
-        raise checks.input_error(f"{call}: times", list(moments), "above 0 h", hint)
-    columns = {}
-    for option, given in (("values", values), ("spread", spread)):
-        if not hasattr(given, "keys") or set(given.keys()) != set(functions):
-            rule = f"numbers by the names {', '.join(map(repr, functions))}"
-            raise checks.input_error(f"{call}: {option}", given, rule)
-        for name in functions:
-            label = f"{call}: {option}[{name!r}]"
-            columns[option, name] = _column(label, given[name], len(moments), option == "spread")
+        raise checks.input_error(f"{MEASURES}: times", list(moments), "above 0 h", hint)
+    given = dict(checked_columns(f"{MEASURES}: values", values, functions))
+    columns: dict[str, dict[str, Any]] = {}
+    if any(map(_is_table, given.values())):
+        columns["wanted"], columns["spread"], count = _of_colonies(given, moments, spread)
+        if colonies not in (1, count):
+            rule = f"left out, as the values are of {count} colonies"
+            raise checks.input_error(f"{MEASURES}: colonies", colonies, rule)
+        colonies = count
+        error = dict.fromkeys(functions, 0.0) if error is None else error
+    else:
+        for option, numbers in ("wanted", given), ("spread", spread):
+            columns[option] = _columns(option, numbers, functions, len(moments))
+    if error is not None:
+        columns["error"] = _columns("error", error, functions, len(moments))
     frames = []
     for k, time in enumerate(moments):
-        there = [name for name in functions if not math.isnan(columns["values", name][k])]
-        parts = [
-            {name: columns[option, name][k] for name in there} for option in ("values", "spread")
-        ]
-        known = {name: functions[name] for name in there}
+        known = {n: f for n, f in functions.items() if not math.isnan(columns["wanted"][n][k])}
+        of: Any = {option: {n: of[n][k] for n in known} for option, of in columns.items()}
+        how: Any = {"extinct": extinct, "smooth": smooth, "colonies": colonies}
         if known:
-            how: Any = {"extinct": extinct, "smooth": smooth, "colonies": colonies}
-            frames.append(Measured(known, *parts, **how, time=time))
+            frames.append(Measured(known, **of, **how, time=time))
     if len(frames) < 2:
-        given = f"{len(moments)} times, of which {len(frames)} have a value"
+        found = f"{len(moments)} times, of which {len(frames)} have a value"
         hint = "Of one time, give Measured(…, time=…)."
-        raise checks.input_error(f"{call}: values", given, "of two times at least", hint)
+        raise checks.input_error(f"{MEASURES}: values", found, "of two times at least", hint)
     return frames
+
+
+def _is_table(given: Any) -> bool:
+    """Whether numbers are by time and colony."""
+    try:
+        return np.ndim(given) == 2
+    except ValueError:  # lists of different lengths
+        return False
+
+
+def _of_colonies(
+    values: Mapping[str, Any], moments: Sequence[float], spread: Any
+) -> tuple[dict[str, Any], dict[str, Any], int]:
+    """Means and spreads by name, (T,) each, and the number of colonies, of numbers by time and
+    colony."""
+    if spread is not None:
+        rule = "left out where values are given of each colony, which tell how much these differ"
+        raise checks.input_error(f"{MEASURES}: spread", spread, rule)
+    found, counts = {}, {}
+    for name, given in values.items():
+        label = f"{MEASURES}: values[{name!r}]"
+        rule = (
+            f"numbers by time and colony, {len(moments)} rows; NaN of all where a time is missing"
+        )
+        rows = np.asarray(given, dtype=float) if _is_table(given) else np.empty((0, 0))
+        missing = np.isnan(rows)
+        if len(rows) != len(moments) or (missing.any(1) != missing.all(1)).any():
+            raise checks.input_error(label, given, rule)
+        found[name], counts[name] = mean_and_spread(label, rows), rows.shape[1]
+    if len(set(counts.values())) > 1:
+        raise checks.input_error(f"{MEASURES}: values", counts, "numbers of as many colonies each")
+    means, spreads = ({name: pair[k] for name, pair in found.items()} for k in (0, 1))
+    return means, spreads, next(iter(counts.values()))
+
+
+def _columns(option: str, given: Any, functions: Mapping[str, Any], count: int) -> dict[str, Any]:
+    """Numbers of each time by name; of all but the wanted values, one will do."""
+    name_of = {"wanted": "values"}.get(option, option)
+    label = f"{MEASURES}: {name_of}"
+    return {
+        name: _column(f"{label}[{name!r}]", numbers, count, option != "wanted")
+        for name, numbers in checked_columns(label, given, functions)
+    }
 
 
 def _column(label: str, given: Any, count: int, one_will_do: bool) -> list[float]:

@@ -16,8 +16,8 @@ from design.targets.observed import Observed
 
 @dataclass(frozen=True)
 class MeasureStatistics:
-    """Measures of one's own: their names, the standard errors of the data, and a digest of their
-    code."""
+    """Measures of one's own: their names, the standard errors of measurement of the data, and a
+    digest of their code."""
 
     names: tuple[str, ...]
     errors: tuple[float, ...]
@@ -35,8 +35,8 @@ class MeasureStatistics:
 @dataclass(frozen=True, init=False)
 class ObservedMeasures(Observed):
     """The wanted values of `measured` as data: each was measured with an error, normal, whose
-    standard deviation is its spread. Simulations get such errors, too. A range is no data; a search
-    takes it all the same."""
+    standard deviation is its spread, unless `measured` has one. Simulations get such errors, too. A
+    range is no data; a search takes it all the same."""
 
     plan: MeasureStatistics  # type: ignore[assignment]
     measured: Measured = field(repr=False)
@@ -46,12 +46,14 @@ class ObservedMeasures(Observed):
         # of a range an end that is a number
         values = [low if math.isfinite(low) else min(high, 1e300) for low, high in ends]  # type: ignore[misc]
         spread = tuple(float(measured.spread[name]) for name in measured.functions)
+        own = measured.spread if measured.error is None else measured.error
+        errors = tuple(float(own[name]) for name in measured.functions)
         code = tf.digest(dict(measured.functions))
         found = {
             "measured": measured,
             "values": tuple(values),
             "spread": spread,
-            "plan": MeasureStatistics(tuple(measured.functions), spread, code),
+            "plan": MeasureStatistics(tuple(measured.functions), errors, code),
             "colonies": measured.colonies,
             "cells": 0,
             "time": measured.time,

@@ -8,11 +8,10 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
+from design.targets.measured import ENOUGH, FINEST
 from design.targets.statistics import LOG_CELLS, ColonyStatistics, SeenCells, resampled_spread
 from torchfilm import checks
 
-ENOUGH = 3  # colonies from which on the spread between them is measured
-FINEST = 0.01  # the least spread, relative to the greatest statistic of its group
 # The least spread of the logarithm of a number of cells; and of the number itself, which is whole.
 COUNT, PART = 0.02, 0.5
 VARIED = 0.01  # the least spread of a coefficient of variation
