@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 import torchfilm as tf
 
@@ -169,3 +170,43 @@ def test_colonies_grow_from_it():
 def test_what_is_no_inoculum(given, words):
     with pytest.raises(tf.InputError, match=words):
         tf.inoculum(**{"count": 30, "radius": 15.0, **given})
+
+
+# --- numbers of each type, and variables ----------------------------------------------------------
+
+
+def test_types_may_be_numbers_of_cells():
+    founders = tf.inoculum(30, 15.0, types={0: 3, 1: 27}, colonies=2)
+    kinds = founders.cell_type.reshape(2, 30)
+    assert (kinds == 0).sum(1).tolist() == [3, 3]
+    same = tf.inoculum(30, 15.0, types={0: 0.1, 1: 0.9}, colonies=2)
+    assert np.array_equal(founders.cell_type, same.cell_type)
+    assert np.bincount(tf.inoculum(2, 9.0, types={0: 1, 1: 1}).cell_type).tolist() == [1, 1]
+    assert set(tf.inoculum(5, 9.0, types={0: 1, 1: 0}).cell_type) == {0}  # shares
+    with pytest.raises(tf.InputError, match=r"sum to the count, 30, .*Their sum is 29"):
+        tf.inoculum(30, 15.0, types={0: 3, 1: 26})
+    with pytest.raises(tf.InputError, match=r"types\[0\] = -3"):
+        tf.inoculum(30, 15.0, types={0: -3, 1: 33})
+
+
+def test_a_share_of_which_no_cell_comes_is_warned_of():
+    with pytest.warns(UserWarning, match=r"types\[0\] = 0.01 is so small a share of 30 cells"):
+        founders = tf.inoculum(30, 15.0, types={0: 0.01, 1: 0.99})
+    assert set(founders.cell_type) == {1}
+    tf.inoculum(30, 15.0, types={0: 0.0, 1: 1.0})  # none is wanted
+
+
+def test_variables_may_differ_by_type():
+    given = {"plasmids": {0: 4, 1: 0}, "age": 1.5}
+    founders = tf.inoculum(6, 9.0, types={0: 2, 1: 4}, colonies=2, extra=given)
+    state = tf.Scene(tf.Growth(), founders=founders, dim=2).bind(2).start()
+    assert torch.equal(state.plasmids, 4.0 * (state.cell_type == 0))
+    assert (state.age == 1.5).all()
+    with pytest.raises(
+        tf.InputError, match=r"extra\['plasmids'\] = .*a value for each of the types"
+    ):
+        tf.inoculum(6, 9.0, types={0: 2, 1: 4}, extra={"plasmids": {0: 4}})
+    with pytest.raises(tf.InputError, match=r"extra\['plasmids'\]\[1\] = 'few'"):
+        tf.inoculum(6, 9.0, types={0: 2, 1: 4}, extra={"plasmids": {0: 4, 1: "few"}})
+    with pytest.raises(tf.InputError, match=r"extra = 4 .*numbers by name"):
+        tf.inoculum(6, 9.0, extra=4)

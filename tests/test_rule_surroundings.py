@@ -219,3 +219,105 @@ def test_distances_are_finite(state):
     for within in (-1.0, float("inf"), float("nan"), "near"):
         with pytest.raises(InputError, match=r"contacts\(within\)"):
             seen(state).contacts(within)
+
+
+# --- draws of pairs -------------------------------------------------------------------------------
+
+
+def test_draws_of_contacts_are_keyed_by_both_cells(state):
+    one, other = seen(state), seen(state)
+    i, j = one.contacts(0.1)
+    found = one.contact_random(i, j)
+    assert found.dtype == torch.float64 and len(i) > 50
+    assert ((found > 0) & (found < 1)).all() and len(found.unique()) == len(found)
+    assert abs(float(found.mean()) - 0.5) < 4 / (12 * len(i)) ** 0.5
+    flipped = torch.arange(len(i)).flip(0)
+    assert torch.equal(other.contact_random(i[flipped], j[flipped]), found[flipped])
+    assert not (one.contact_random(i, j) == found).any()  # each call gives new ones
+    assert not (seen(state).contact_random(j, i) == found).any()
+
+
+def test_draws_of_contacts_do_not_depend_on_the_batch(state):
+    every, alone = seen(state), seen(state.select([2]))
+    i, j = every.contacts(0.1)
+    last = state.colony[i] == 2
+    first = int((state.colony < 2).sum())
+    k, m = alone.contacts(0.1)
+    assert torch.equal(torch.stack([k, m]), torch.stack([i, j])[:, last] - first)
+    assert torch.equal(every.contact_random(i, j)[last], alone.contact_random(k, m))
+
+
+def test_contacts_of_one_cell_draw_for_themselves():
+    """Of a donor between two recipients, in 1,000 colonies: one draw for each cell would give to
+    both or to none."""
+    cells = tf.Cells([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0]], [[1.0, 0.0]] * 3, 3.0)
+    many = seen(tf.Scene(tf.Growth(), founders=cells, dim=2).bind(1000).start())
+    i, j = many.contacts(0.05)
+    assert len(i) == 2000
+    colony = many._state.colony[i[many.contact_random(i, j) < 0.5]]
+    both = torch.bincount(torch.bincount(colony, minlength=1000))
+    assert (both - torch.tensor([250, 500, 250])).abs().max() < 60  # 4 standard deviations
+
+
+def test_pairs_that_draw_are_places_of_cells(state):
+    cells = seen(state)
+    i, j = cells.contacts(0.1)
+    with pytest.raises(tf.InputError, match=r"contact_random\(j\)"):
+        cells.contact_random(i, j.double())
+    with pytest.raises(InputError, match=f"{len(i)} and 3 places: it takes pairs"):
+        cells.contact_random(i, j[:3])
+
+
+def test_contacts_are_looked_for_once_and_a_rule_may_change_its_own(state, monkeypatch):
+    from torchfilm import rule_surroundings
+
+    looked, search = [], rule_surroundings.pairs_within
+    monkeypatch.setattr(
+        rule_surroundings, "pairs_within", lambda *a: (looked.append(a[-2]), search(*a))[1]
+    )
+    cells = seen(state)
+    i, j = cells.contacts(0.1)
+    i.zero_(), j.zero_()
+    counted = cells.contact_count(0.1)
+    assert looked == [0.1] and counted.sum() == 2 * len(i)
+    cells.contact_sum(state.length, 0.1), cells.contact_count(0.2)
+    assert looked == [0.1, 0.2]
+
+
+# --- events ---------------------------------------------------------------------------------------
+
+
+def test_events_happen_at_their_rate(state):
+    many = seen(tf.Scene(tf.Growth(), founders=tf.Cells.single(2), dim=2).bind(20000).start())
+    found = many.event(torch.tensor([0.0, 4.0]).repeat(10000))
+    assert found.dtype == torch.bool and not found[::2].any()
+    share = 1 - 2.718281828 ** (-4.0 * 0.05)
+    assert abs(float(found[1::2].double().mean()) - share) < 4 * (share / 10000) ** 0.5
+    assert not many.event(0.0).any() and many.event(1e6).all()
+
+
+def test_rare_events_keep_their_rate(monkeypatch):
+    """1 − exp(−x) of single precision is 0 below 3e-8, and twice too large just above."""
+    from torchfilm import rule_draws
+
+    cells = seen(tf.Scene(tf.Growth(), founders=tf.Cells.single(2), dim=2).bind().start())
+    for rate in (2e-7, 1e-6):
+        for share, expected in ((0.99, True), (1.01, False)):
+            drawn = torch.tensor([share * rate * 0.05], dtype=torch.float64)
+            monkeypatch.setattr(rule_draws, "fine_uniform", lambda *_, drawn=drawn: drawn)
+            assert bool(cells.event(torch.tensor([rate]))) is expected
+
+
+@pytest.mark.parametrize("rate", [-1.0, float("inf"), float("nan")])
+def test_rates_of_events_are_finite_and_not_below_zero(state, rate):
+    with pytest.raises(InputError, match=r"event was given the rate .* finite, and 0 or more"):
+        seen(state).event(rate)
+
+
+def test_events_of_one_cell_do_not_depend_on_the_others(state):
+    whole, part = seen(state), seen(state.select([2]))
+    first = int((state.colony < 2).sum())
+    of = lambda cells, k: [bool(list(cells)[k].event(10.0)) for _ in range(8)]
+    found = [of(whole, first + k) for k in range(6)]
+    assert found == [of(part, k) for k in range(6)]
+    assert 0 < sum(map(sum, found)) < 48

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +15,7 @@ from torchfilm.distributions import Uniform
 from torchfilm.initial_cells import Cells
 from torchfilm.physics.nearby import gaps_nearby
 from torchfilm.tools import checks
+from torchfilm.tools.warn_once import warn
 from torchfilm.values import Distribution
 
 ROUNDS = 2000  # in which cells that overlap others are placed again
@@ -27,6 +29,7 @@ def inoculum(
     box: tuple[Sequence[float], Sequence[float]] | None = None,
     center: Sequence[float] | None = None,
     types: Mapping[int, float] | None = None,
+    extra: Mapping[str, Any] | None = None,
     colonies: int = 1,
     dim: int = 2,
     length: float | Uniform | Sequence[float] | np.ndarray | Tensor | Mapping[int, Any] = 2.0,
@@ -42,25 +45,30 @@ def inoculum(
     lower and upper corner of the rectangle, or block, that does: box=((0, 0), (100, 4)) for a
     front. center: of the disc, µm, by default the origin. types: the share of each cell type, which
     together are 1; each colony has these shares, as near as whole numbers of cells come to them,
-    and who is of which type is drawn. dim: 2 or 3. length: of the centreline, µm: one number;
-    tf.Uniform(2, 4) to draw each, since cells of one length divide all at once; a dict of these by
-    type, {0: 2.0, 1: tf.Uniform(0, 1)}; or one for each of `count` cells, the same in all colonies.
-    cell_radius: µm, one number, or a dict by type. floor: in 3-D, µm: cells lie flat on a floor at
-    this z, in a disc or a rectangle, instead of in a ball or a block. No two cells overlap. Colony
-    k is the same whatever their number.
-    Raises InputError for shares that do not sum to 1, and where the cells do not find room: rods
-    placed one after the other at random fill at most about 45 % of an area, 30 % of a volume.
+    and who is of which type is drawn; or their numbers, {0: 3, 1: 27}, which together are `count`.
+    extra: variables of the cells by name, one number, or a dict by type: {"plasmids": {0: 4, 1:
+    0}}. dim: 2 or 3. length: of the centreline, µm: one number; tf.Uniform(2, 4) to draw each,
+    since cells of one length divide all at once; a dict of these by type, {0: 2.0, 1: tf.Uniform(0,
+    1)}; or one for each of `count` cells, the same in all colonies. cell_radius: µm, one number, or
+    a dict by type. floor: in 3-D, µm: cells lie flat on a floor at this z, in a disc or a
+    rectangle, instead of in a ball or a block. No two cells overlap. Colony k is the same whatever
+    their number. Raises InputError for shares that do not sum to 1, and where the cells do not find
+    room: rods placed one after the other at random fill at most about 45 % of an area, 30 % of a
+    volume. Warns of a share of which no cell comes.
     """
     checks.integer("count", count, least=1)
     checks.integer("colonies", colonies, least=1)
     checks.choice("dim", dim, (2, 3))
     checks.integer("seed", seed, least=0)
-    shares = _shares(types)
+    shares = _shares(types, count)
     kinds = np.stack(
         [_types(np.random.default_rng([seed, k, 1]), count, shares) for k in range(colonies)]
     )
     lengths = _lengths(length, kinds, shares, seed)
-    radii = _radii(cell_radius, kinds, shares)
+    radii = _of_each("cell_radius", cell_radius, kinds, shares, above=0.0)
+    if extra is not None and not isinstance(extra, Mapping):
+        raise checks.input_error("extra", extra, 'numbers by name, such as {"plasmids": 4}')
+    more = {n: _of_each(f"extra[{n!r}]", x, kinds, shares) for n, x in (extra or {}).items()}
     if floor is not None:
         checks.number("floor", floor)
         if dim == 2:
@@ -79,6 +87,7 @@ def inoculum(
         radii.reshape(-1),
         cell_type=None if shares is None else kinds.reshape(-1),
         colony=None if colonies == 1 else np.repeat(np.arange(colonies), count),
+        extra={name: numbers.reshape(-1) for name, numbers in more.items()},
     )
 
 
@@ -92,16 +101,20 @@ def _by_type(name: str, given: Mapping[int, Any], shares: Mapping[int, float] | 
         raise checks.input_error(name, dict(given), rule, hint if shares is None else "")
 
 
-def _radii(
-    given: float | Mapping[int, float], kinds: np.ndarray, shares: Mapping[int, float] | None
+def _of_each(
+    name: str,
+    given: Any,
+    kinds: np.ndarray,
+    shares: Mapping[int, float] | None,
+    above: float = -math.inf,
 ) -> np.ndarray:
-    """The radius of each cell, of the shape of their `kinds`, checked."""
+    """A number of each cell, of the shape of their `kinds`, of one or a dict by type, checked."""
     if not isinstance(given, Mapping):
-        return np.full(kinds.shape, checks.number("cell_radius", given, above=0.0))
-    _by_type("cell_radius", given, shares)
+        return np.full(kinds.shape, checks.number(name, given, above=above))
+    _by_type(name, given, shares)
     found = np.empty(kinds.shape)
     for kind, value in given.items():
-        found[kinds == kind] = checks.number(f"cell_radius[{kind}]", value, above=0.0)
+        found[kinds == kind] = checks.number(f"{name}[{kind}]", value, above=above)
     return found
 
 
@@ -148,32 +161,54 @@ def _drawn(name: str, given: Uniform, kinds: np.ndarray, seed: int) -> np.ndarra
     return low + (high - low) * np.stack(list(draws))
 
 
-def _shares(types: object) -> dict[int, float] | None:
-    """The share of each type, checked."""
+def _shares(types: object, count: int) -> dict[int, float] | None:
+    """The share of each type, checked, from shares or numbers of `count` cells."""
     if types is None:
         return None
     if not isinstance(types, Mapping) or not types:
         raise checks.input_error("types", types, "a share for each cell type, {0: 0.9, 1: 0.1}")
-    for kind, share in types.items():
+    for kind in types:
         checks.integer("types", kind, least=0)
+    whole = all(isinstance(n, int | np.integer) and type(n) is not bool for n in types.values())
+    if whole and (sum(types.values()) == count or set(types.values()) - {0, 1}):
+        numbers = {k: checks.integer(f"types[{k}]", n, least=0) for k, n in types.items()}
+        if sum(numbers.values()) != count:
+            rule = f"numbers that sum to the count, {count}, or shares that sum to 1"
+            raise checks.input_error(
+                "types", numbers, rule, f"Their sum is {sum(numbers.values())}."
+            )
+        types = {kind: n / count for kind, n in numbers.items()}
+    for kind, share in types.items():
         checks.number(f"types[{kind}]", share, least=0.0, most=1.0)
     total = float(sum(types.values()))
     if abs(total - 1.0) > 1e-6:
         raise checks.input_error(
             "types", dict(types), "shares that sum to 1", f"Their sum is {total:g}."
         )
-    return {int(k): float(v) for k, v in sorted(types.items())}
+    shares = {int(k): float(v) for k, v in sorted(types.items())}
+    numbers = dict(zip(shares, _numbers(count, shares), strict=True))
+    if none := [kind for kind, share in shares.items() if share > 0 and not numbers[kind]]:
+        warn(
+            f"types[{none[0]}] = {shares[none[0]]:g} is so small a share of {count} cells that none"
+            f" comes. Take more cells, or give numbers, such as types={{{none[0]}: 1, …}}."
+        )
+    return shares
 
 
 def _types(rng: np.random.Generator, count: int, shares: dict[int, float] | None) -> np.ndarray:
     """The type of each cell, (count,): whole numbers by the largest remainders, in random order."""
     if shares is None:
         return np.zeros(count, np.int64)
+    return rng.permutation(np.repeat(list(shares), _numbers(count, shares)))
+
+
+def _numbers(count: int, shares: Mapping[int, float]) -> np.ndarray:
+    """How many cells are of each type."""
     wanted = count * np.array(list(shares.values()))
     numbers = np.floor(wanted + 1e-9).astype(int)
     left = np.argsort(numbers - wanted, kind="stable")[: count - numbers.sum()]
     numbers[left] += 1
-    return rng.permutation(np.repeat(list(shares), numbers))
+    return numbers
 
 
 @dataclass(frozen=True)

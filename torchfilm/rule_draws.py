@@ -13,7 +13,8 @@ from torchfilm.circuits.molecules import nearest
 from torchfilm.circuits.partition import binomial
 from torchfilm.rule_values import RuleError, as_tensor
 from torchfilm.state import State
-from torchfilm.tools.random import fine_uniform
+from torchfilm.tools.random import MASK, fine_uniform, uniform
+from torchfilm.tools.row_checks import check_rows
 
 
 class Draws:
@@ -43,7 +44,7 @@ class Draws:
 
     def chance(self, probability: float | Tensor) -> Tensor:
         """Whether something of this probability happens to each cell, (N,), or at each division,
-        (M,), bool. For a rate, 1/h, give 1 − exp(−rate · cells.dt)."""
+        (M,), bool. Of what happens at a rate, `cells.event(rate)` knows whether it does."""
         fine = self._fine()
         return fine < _probability("chance", probability, fine)
 
@@ -80,11 +81,47 @@ class Draws:
         return binomial(count, _probability("binomial", probability, drawn), drawn)
 
 
-class OneCell(Draws):
+class StepDraws(Draws):
+    """What cells draw in a step."""
+
+    _dt: float
+
+    def event(self, rate: float | Tensor) -> Tensor:
+        """Whether what happens at this rate, 1/h, does so in this step, to each cell, (N,) bool: of
+        the probability 1 − exp(−rate · dt)."""
+        fine = self._fine()
+        each = _column("event", rate, fine)
+        wrong = ~((each >= 0) & each.isfinite())
+        if bool(wrong.any()):
+            raise RuleError(
+                f"event was given the rate {each[wrong][0]:g}: it must be finite, and 0 or more"
+            )
+        return fine < -torch.expm1(-each * self._dt)
+
+    def contact_random(self, i: Tensor, j: Tensor) -> Tensor:
+        """A draw from (0, 1) for each pair of cells, (P,) float64, keyed by both of them in this
+        order, beside seed, colony and step: `cells.contact_random(i, j) < probability`. The draws
+        of `random` and its like are one for each cell, so that all pairs of a cell share them."""
+        state = self._state
+        for name, rows in ("contact_random(i)", i), ("contact_random(j)", j):
+            check_rows(name, rows, state.cells)
+        if i.shape != j.shape:
+            raise RuleError(
+                f"contact_random was given {len(i)} and {len(j)} places: it takes pairs, (P,) each"
+            )
+        _, purpose = self._next()
+        uid = (state.uid[i] & MASK) | ((state.uid[j] & MASK) << 32)
+        key = state.seed, state.stream[state.colony[i]], uid, state.step
+        coarse, fine = (uniform(*key, f"{purpose} pair {k}", torch.float64) for k in (0, 1))
+        return fine_uniform(coarse, fine)
+
+
+class OneCell(StepDraws):
     """What a loop over cells draws for one of them: its numbers do not depend on the others."""
 
-    def __init__(self, cells: Draws, index: int):
+    def __init__(self, cells: StepDraws, index: int):
         self._state, self._draws, self._purpose = cells._state, 0, f"{cells._purpose} one by one"
+        self._dt = cells._dt
         self._rows = torch.tensor([index], device=cells._state.device)
 
 

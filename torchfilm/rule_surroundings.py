@@ -13,6 +13,7 @@ from torchfilm.rule_values import real_column
 from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
+from torchfilm.tools.threads import one_torch_thread
 
 
 class Surroundings:
@@ -20,6 +21,7 @@ class Surroundings:
 
     _state: State
     _read: set[str]
+    _pairs: dict[float, tuple[Tensor, Tensor]]  # by the distance within which they are
 
     def colony_max(self, value: Tensor) -> Tensor:
         """The greatest value in each cell's own colony, (N,) -> (N,)."""
@@ -43,19 +45,25 @@ class Surroundings:
         mean = self._state.groups.sum(value) / self._state.counts.clamp(min=1)
         return mean.index_select(0, self._state.colony)
 
+    @one_torch_thread()  # or its others wait in a loop while the next step is computed
     def contacts(self, within: float = 0.05) -> tuple[Tensor, Tensor]:
         """Pairs of cells of one colony whose surfaces are at most `within` µm apart: two (P,)
         tensors i, j of places among the cells.
 
         Each pair occurs once, in either order: what goes from cell to cell both ways needs both
-        (i, j) and (j, i), as in `contact_sum`. The search runs only when a rule calls this.
+        (i, j) and (j, i), as in `contact_sum`. What each pair draws for itself is
+        `contact_random(i, j)`. The search runs only when a rule calls this, once for each `within`.
         """
-        checks.number("contacts(within)", within, least=0.0)
+        distance = checks.number("contacts(within)", within, least=0.0)
         self._read.update(("position", "axis", "length", "radius"))
-        s = self._state
-        shape = s.position, s.axis, s.length, s.radius
-        return pairs_within(*shape, s.groups, float(within), s.space)
+        if distance not in self._pairs:
+            s = self._state
+            shape = s.position, s.axis, s.length, s.radius
+            self._pairs[distance] = pairs_within(*shape, s.groups, distance, s.space)
+        i, j = self._pairs[distance]
+        return i.clone(), j.clone()  # which a rule may change
 
+    @one_torch_thread()
     def contact_sum(self, value: Tensor, within: float = 0.05) -> Tensor:
         """The sum of a value over the cells that each cell touches, (N,) -> (N,); of a condition,
         how many of them fulfil it: `cells.contact_sum(cells.cell_type == 1)`. within: as of
@@ -65,11 +73,13 @@ class Surroundings:
         given = torch.cat([value.index_select(0, j), value.index_select(0, i)])
         return Groups(torch.cat([i, j]), self._state.cells).sum(given)
 
+    @one_torch_thread()
     def contact_count(self, within: float = 0.05) -> Tensor:
         """The number of cells that each cell touches, (N,) int64."""
         i, j = self.contacts(within)
         return torch.bincount(torch.cat([i, j]), minlength=self._state.cells)
 
+    @one_torch_thread()
     def below_top(
         self,
         spacing: float = 1.0,

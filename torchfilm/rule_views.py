@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.circuits.names import Names
-from torchfilm.rule_draws import Draws, OneCell
+from torchfilm.rule_draws import Draws, OneCell, StepDraws
 from torchfilm.rule_surroundings import Surroundings
 from torchfilm.rule_values import (
     REMOVED_LATER,
@@ -46,7 +46,7 @@ IDENTITY = ("uid", "parent", "colony")
 # fields that only an effect acts on
 OF_EFFECTS = {"growth_rate": "tf.Growth()", "divide_flag": "tf.Division()"}
 SECRETES = "a circuit says what cells give to a signal and take from it"
-ONE_BY_ONE = ("random", "normal", "chance", "binomial", "poisson")
+ONE_BY_ONE = ("random", "normal", "chance", "event", "binomial", "poisson")
 # How a view finds the constants that rules were given, its `p`; None: they were given none.
 Constants = Callable[[], Names] | None
 KNOWN_FIELDS = {
@@ -75,7 +75,7 @@ def _known_names(state: State) -> list[str]:
     return [*GEOMETRY, *IDENTITY, *fields]
 
 
-class CellsView(Draws, Surroundings):
+class CellsView(StepDraws, Surroundings):
     """The cells as a rule sees them: every name is a tensor over all cells, (N,) or (N, d).
 
     `for cell in cells` gives them one by one (slow). A rule may read position (pos; x, y, z), axis
@@ -96,6 +96,7 @@ class CellsView(Draws, Surroundings):
     _declaring: bool
     _draws: int
     _draws_of: dict[int, OneCell]
+    _pairs: dict[float, tuple[Tensor, Tensor]]
     _constants: Constants
 
     def __init__(
@@ -110,7 +111,7 @@ class CellsView(Draws, Surroundings):
         self.__dict__.update(
             _state=state, _rows=None, _purpose=label, _dt=dt, _work={}, _read=set(), _shown={},
             _given={}, _around=None, _written=set(), _declaring=declaring, _draws=0, _draws_of={},
-            _constants=constants,
+            _pairs={}, _constants=constants,
         )  # fmt: skip
 
     @property

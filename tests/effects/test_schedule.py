@@ -398,3 +398,11 @@ def test_types_go_into_a_schedule_and_not_schedules_into_types(make):
     with pytest.raises(tf.InputError, match=r"\[1\] = Schedule.*tf.Schedule\(\{0: \{0: …, 1: …\}"):
         make({0: 1.0, 1: tf.Schedule({0: 0.0, 1: 2.0})})
     make(tf.Schedule({0: {0: 1.0, 1: 0.0}, 1: {0: 1.0, 1: 2.0}}))
+
+
+def test_before_the_first_time_the_first_value_holds():
+    """As for a dead time, `light(cells.time - 0.2)`."""
+    light = tf.Schedule({0: 0.5, 1: 1.0, 2: 3.0})
+    assert light(np.array([-5.0, -1e-12, 0.0, 0.99, 1.0, 2.5])).tolist() == [0.5] * 4 + [1.0, 3.0]
+    again = tf.Schedule({0: 0.5, 1: 1.0}, period=2.0)
+    assert again([-2.0, -1.5, -1.0, -0.5]).tolist() == [0.5, 0.5, 1.0, 1.0]

@@ -26,13 +26,14 @@ class Schedule(metaclass=checks.KnownKeywords):
     3 h, and 0 before and after.
 
     values: by the time, h, from which each holds; one holds from 0 h. Each is what might stand in
-    place of the schedule. period: hours after which the values begin again; None: the last value
-    stays.
+    place of the schedule. period: hours after which the values begin again, and before 0 h end;
+    None: the last value stays, and the first holds before 0 h, too.
 
     A medium takes one in place of a source, a flow, a reservoir or the value at a face, with the
     value that holds as a step begins. A circuit takes one as a constant: `p.light` of
     `Circuit(…, light=schedule)` has the value of the middle of a step. In `Lysis`, and in rules as
-    `schedule(cells.time)`, it is that of its beginning.
+    `schedule(cells.time)`, it is that of its beginning; with a dead time, `schedule(cells.time −
+    delay)`.
     """
 
     values: Mapping[float, Any]
@@ -68,8 +69,9 @@ class Schedule(metaclass=checks.KnownKeywords):
 
     def place(self, time: float) -> int:
         """Which of the values holds at a time, h."""
-        after = time + ROUNDING * max(1.0, time)
-        return bisect_right(self.times, after if self.period is None else after % self.period) - 1
+        after = time + ROUNDING * max(1.0, abs(time))
+        now = max(after, 0.0) if self.period is None else after % self.period
+        return bisect_right(self.times, now) - 1
 
     def at(self, time: float) -> Any:
         """The value at a time, h."""
