@@ -21,7 +21,7 @@ from recorded import record
 import torchfilm as tf
 from torchfilm.cli.export import Export
 from torchfilm.io import cell_tracking, new_file
-from torchfilm.io.cell_tracking import Tracks
+from torchfilm.io.cell_tracking import Tracks, _warn_of
 
 tifffile = pytest.importorskip("tifffile", reason="the extra images")
 PIXEL = 0.1
@@ -51,6 +51,7 @@ def read(folder):
     assert all(re.fullmatch(r"[1-9]\d* \d+ \d+ \d+", line) for line in lines)
     rows = [tuple(map(int, line.split(" "))) for line in lines]
     tracks = {label: rest for label, *rest in rows}
+    assert [*tracks] == sorted(tracks)
     assert len(tracks) == len(rows) > 0 and max(tracks) <= 65535
     masks = stack(folder / "01_GT/TRA", "man_track")
     for k, mask in enumerate(masks):
@@ -164,6 +165,11 @@ def test_a_cell_that_another_one_covers_goes_on_under_a_new_label(tmp_path):
     assert tracks == {1: [0, 10, 0], 2: [0, 4, 0], 3: [6, 10, 2]} and cells == {1: 0, 2: 1, 3: 1}
 
 
+def test_a_cell_that_is_hidden_in_several_frames_counts_once():
+    with pytest.warns(UserWarning, match="^1 cell inside .* first of them cell 4 in frame 5:"):
+        _warn_of([(4, 5), (4, 6)], [])
+
+
 def test_pixels_as_large_as_cells_keep_the_format(run, tmp_path):
     """Which cells have a pixel changes from frame to frame."""
     view = {**COMMON, "pixel_size": 2.0}
@@ -226,6 +232,9 @@ def test_16_bits_hold_65535_labels():
     full.labels(np.arange(1, 65535), 1)
     with pytest.raises(tf.InputError, match=r"colony 0 needs more than 65535 labels by frame 2"):
         full.labels(np.arange(65535), 2)  # cell 0 has come back
+    assert Tracks(family(65535), 0).labels(np.array([65534]), 0) == [65535]
+    many = Tracks(family(65536), 0)
+    assert many.labels(np.arange(1, 65536), 0) == [*range(1, 65536)]  # all that there are
     many = Tracks(family(65536), 0)
     with pytest.raises(tf.InputError, match=r"16 bits.*fewer frames.*smaller window"):
         many.labels(np.arange(65536), 0)

@@ -126,6 +126,37 @@ def test_what_does_not_fit_is_refused():
         signalling().bind(3).start().put([0], strange, taken=[0])
 
 
+def test_colonies_of_another_space_are_not_put():
+    cells = tf.Cells([[1.0, 1.0]], [1.0, 0.0])
+
+    def first(periodic, faces, height):
+        medium = tf.Medium(
+            a=tf.Signal(1.0), box=((0, 0), (20, 20)), spacing=5.0, height=height, boundary=faces
+        )
+        mechanics = tf.Mechanics(dim=2, periodic=periodic)
+        return tf.Scene(mechanics, medium, founders=cells).bind(2).start()
+
+    closed, wraps = tf.BoundaryConditions(), tf.BoundaryConditions(y=tf.Periodic())
+    state = first(None, closed, 0.0)
+    assert state.put([0], first(None, closed, 0.0), taken=[1]).cells == 2
+    for other in (first(None, wraps, 0.0), first(None, closed, 0.25)):
+        with pytest.raises(tf.InputError, match="spacing, periodic axes and height"):
+            state.put([0], other, taken=[1])
+    with pytest.raises(tf.InputError, match=r"other\.space"):
+        first({"y": (0, 20)}, wraps, 0.0).put([0], first(None, wraps, 0.0), taken=[1])
+
+
+def test_a_detached_state_keeps_nothing_of_the_step_before():
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.0), dt=0.1, dim=2)
+    states = tf.simulate(scene, until=1.0)
+    state = next(s for s in states if s.births)
+    state = state.replace(reports={"mine": state})
+    cut = state.detach()
+    assert state.ended and (cut.births, cut.ended, dict(cut.reports)) == ((), (), {})
+    moved = state.to("cpu")
+    assert (moved.births, moved.ended, dict(moved.reports)) == ((), (), {})
+
+
 def test_derivatives_pass_and_detach_cuts_them():
     rate = torch.tensor([1.0, 1.3, 1.6], dtype=torch.float64, requires_grad=True)
     scene = tf.Scene(tf.Growth(rate=rate, law="length"), dim=2, dt=0.1)

@@ -238,6 +238,8 @@ def test_a_cell_of_several_colonies_needs_its_colony(whole):
             tree.course(9999, colony=1)
         with pytest.raises(tf.InputError, match=r"colony = 7"):
             tree.to_newick(7)
+        with pytest.raises(tf.InputError, match=r"colony = True"):
+            tree.ancestors(0, colony=True)
         with pytest.raises(tf.InputError, match=r"cell = 1\.5"):
             tree.descendants(1.5, colony=0)
 
@@ -259,6 +261,12 @@ def test_lineage_of_a_run_that_starts_in_the_middle_of_another(tmp_path):
     for key, parent, born in zip(keys, found.parent.tolist(), found.born, strict=True):
         assert key in begun or (key[0], parent) in keys
         assert np.isnan(born) if key in begun else born > state.time
+    assert np.isnan(found.birth_length).tolist() == np.isnan(found.born).tolist()
+    assert found.last_seen == pytest.approx(np.where(np.isnan(found.ended), found.now, found.ended))
+    assert (
+        found.first_seen.tolist()
+        == np.where(np.isnan(found.born), found.begin, found.born).tolist()
+    )
     alive = [k for k, fate in zip(keys, found.fate, strict=True) if fate == "alive"]
     assert sorted(alive) == sorted(zip(last["colony"].tolist(), last["uid"].tolist(), strict=True))
     assert "nan" not in newick and newick.count(";") == len(begun)

@@ -254,6 +254,28 @@ def test_appending_from_another_moment_is_refused_and_harms_nothing(whole, tmp_p
     assert_same_file(whole[0], path)
 
 
+def test_frames_are_counted_from_the_first_one(tmp_path):
+    scene, path = make_scene(), tmp_path / "run.h5"
+    *_, state = tf.simulate(scene, scene.bind(1, seed=2).start(), until=3 * DT)
+    record(scene, state, path, until=12 * DT)
+    with tf.Results(path) as results:
+        assert results.steps.tolist() == [3, 10, 12]
+
+
+def test_a_state_of_another_run_is_not_appended(whole, tmp_path):
+    path, scene = tmp_path / "run.h5", make_scene()
+    shutil.copy(whole[0], path)
+    with tf.Results(path) as results:
+        last = results.state(scene)
+    other = last.replace(stream=last.stream + 5)
+    with pytest.raises(tf.InputError, match=r"streams\) .* of .*, as .* is"):
+        record(scene, other, path, until=UNTIL + DT, append=True)
+    with pytest.raises(tf.InputError, match="with other cells"):
+        later = last.replace(next_uid=last.next_uid + 1)
+        record(scene, later, path, until=UNTIL + DT, append=True)
+    assert_same_file(whole[0], path)
+
+
 def test_numbers_of_a_ready_scene_come_back_as_its_recipe(tmp_path):
     for given in (1.0, [1.0, 0.5], torch.tensor([1.0, 0.5]), np.array([1.0, 0.5])):
         scene = tf.scenes.microcolony(rate=given)

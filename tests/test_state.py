@@ -118,6 +118,29 @@ def test_counts_follow_a_replaced_colony():
     assert state.take(torch.tensor([0, 2, 3])).counts.tolist() == [1, 2]
 
 
+def test_what_a_state_works_out_follows_each_part_that_it_is_of():
+    medium = tf.Medium(a=tf.Signal(1.0), box=((-4, -4), (4, 4)), spacing=4.0)
+    state = tf.Scene(medium, founders=tf.Cells.single(2)).bind(2).start()
+    before = state.volume, state.area, state.counts, state.position_3d
+    for part in ("length", "radius"):
+        longer = state.replace(**{part: 2 * getattr(state, part)})
+        assert bool((longer.volume > before[0]).all()) and bool((longer.area > before[1]).all())
+    more = state.replace(colony_id=torch.arange(3))
+    assert more.counts.tolist() == [1, 1, 0] and more.groups.size == 3
+    higher = state.replace(layout=dataclasses.replace(state.layout, height=0.5))
+    assert before[3][:, 2].tolist() == [0.0, 0.0] and higher.position_3d[:, 2].tolist() == [0.5] * 2
+    assert state.replace(position=state.position + 1.0).position_3d[0].tolist() == [1.0, 1.0, 0.0]
+
+
+@pytest.mark.parametrize("part", ["length", "radius"])
+def test_a_volume_that_was_asked_for_without_gradients_has_them_later(part):
+    state = batch()
+    state = state.replace(**{part: getattr(state, part).clone().requires_grad_()})
+    with torch.no_grad():
+        assert not state.volume.requires_grad and not state.area.requires_grad
+    assert state.volume.requires_grad and state.area.requires_grad
+
+
 # --- select, take, remove -------------------------------------------------------------------------
 
 
@@ -131,6 +154,13 @@ def test_select_in_the_order_given():
 
 def test_select_of_a_selection_keeps_the_first_ids():
     assert batch().select([3, 2, 0]).select([1]).colony_id.tolist() == [2]
+
+
+def test_a_place_gets_the_colony_that_is_named_for_it():
+    state = batch()
+    mixed = state.put([0, 3], state, taken=[2, 0])
+    assert mixed.counts.tolist() == [3, 0, 3, 2] and mixed.colony_id.tolist() == [0, 1, 2, 3]
+    assert mixed.position[:, 0].tolist() == [20.0] * 6 + [0.0] * 2
 
 
 def test_select_takes_fields_per_colony_along():

@@ -72,6 +72,16 @@ def test_movies_are_apart_and_each_has_its_end():
         tree.ancestors(2)
 
 
+def test_a_lineage_knows_when_its_frames_are():
+    late = [(1, 0, 300, 2.0), (1, 0, 600, 2.0)]
+    first = [(2, 0, 0, 2.0), (2, 0, 60, 2.0)]
+    tree = tf.Lineage.from_table(table(late + first, colony=[0, 0, 1, 1]))
+    assert (tree.begin, tree.now, tree.interval) == (0.0, 10.0, 3.0)
+    early = [*first, (2, 0, 120, 2.0), (3, 0, 60, 2.0), (3, 0, 70, 2.0)]  # ends before the first
+    tree = tf.Lineage.from_table(table(early, colony=[0] * 3 + [1] * 2))
+    assert tree.now == 2.0 and tree.last_seen.tolist() == pytest.approx([2.0, 7 / 6])
+
+
 def test_units_names_and_widths():
     given = {"ID": [r[0] for r in ROWS], "mother": [r[1] for r in ROWS],
              "when": [r[2] for r in ROWS], "major": [(r[3] + 1.0) / 0.1 for r in ROWS]}  # fmt: skip
@@ -127,6 +137,22 @@ def test_a_gap_between_a_mother_and_her_daughters_is_told():
     rows = [r for r in ROWS if r[0] != 1 or r[2] == 0]
     with pytest.warns(UserWarning, match="2 cells begin later than a frame after their parent's"):
         tf.Lineage.from_table(table(rows))
+
+
+def test_small_gaps_and_shrinkage_are_not_told():
+    later = lambda t: [(c, p, x if c == 1 else x + t, y) for c, p, x, y in ROWS]
+    tf.Lineage.from_table(table(later(4)))  # 14 min after their mother's last frame, of 10 apart
+    with pytest.warns(UserWarning, match="2 cells begin later than a frame"):
+        tf.Lineage.from_table(table(later(6)))
+    shrinking = lambda last: [(1, 0, 0, 2.0), (1, 0, 10, 2.0), (1, 0, 20, last)]
+    tf.Lineage.from_table(table(shrinking(1.6)))
+    with pytest.warns(UserWarning, match="1 cells get shorter"):
+        tf.Lineage.from_table(table(shrinking(1.4)))
+
+
+def test_three_daughters_are_told():
+    with pytest.warns(UserWarning, match=r"1 cells have more than two \(such as 1\)"):
+        tf.Lineage.from_table(table([*ROWS, (6, 1, 20, 1.0)]))
 
 
 def test_founders_and_late_movies_have_clones_and_branches_of_their_own():
@@ -203,6 +229,12 @@ def test_a_file_of_tracks(tmp_path):
     for name in ("born", "ended"):
         assert getattr(tree, name) == pytest.approx(getattr(other, name), nan_ok=True)
     assert tree.now == pytest.approx(5 / 6) and np.isnan(tree.birth_length).all()
+
+
+def test_a_track_of_one_frame_is_a_cell(tmp_path):
+    path = tmp_path / "man_track.txt"
+    path.write_text("1 0 1 0\n2 2 2 1\n3 2 3 1\n", encoding="utf-8")
+    assert tf.Lineage.from_ctc(path, interval=0.5).fate.tolist() == ["divided", "lost", "alive"]
 
 
 @pytest.mark.parametrize(

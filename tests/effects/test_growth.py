@@ -281,6 +281,26 @@ def test_the_tail_of_a_distribution_may_be_too_fast_for_the_step():
     scene.bind().check_step(scene.dt)
 
 
+def test_a_rate_is_warned_of_only_where_a_doubling_takes_half_a_day():
+    with pytest.warns(UserWarning, match=r"0\.04 per hour: a doubling takes 17 h.*\(2\.4\)"):
+        next(tf.simulate(scene_of(0.04, "volume"), until=0.1))
+    for rate, law in ((0.06, "volume"), (0.0, "volume"), (0.04, "linear")):
+        next(tf.simulate(scene_of(rate, law), until=0.1))
+
+
+def test_linear_growth_is_not_refused_as_too_fast_a_doubling():
+    scene_of(60.0, "linear", one_cell(), tf.Division(length=3.0)).bind().check_step(0.05)
+
+
+def test_growth_that_fails_in_one_colony_goes_on_in_others():
+    scene = scene_of([1.0, 5000.0], "volume")
+    state = scene.bind(2).start()
+    after = step(scene, state, 0.5)
+    assert after.reports["growth"].status.tolist() == [0, 1]
+    assert float(after.length[0]) > float(state.length[0])
+    assert after.length[1] == state.length[1] and after.elongation[1] == 0.0
+
+
 def test_a_rule_may_not_set_the_rate_where_it_goes_by_type():
     def update(cells):
         cells.growth_rate = 2.1

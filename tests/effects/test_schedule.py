@@ -352,6 +352,27 @@ def test_a_change_within_a_step_is_warned_of():
         runs(tf.Scene(drug, dim=2), 0.2)
 
 
+def test_times_that_rounding_has_made_less_count_as_reached():
+    dose = tf.Schedule({0: 1.0, 0.3: 2.0, 1000.0: 3.0})
+    assert dose([0.3 - 1e-12, 0.3 - 1e-6, 1000.0 - 1e-7, 1000.0 - 1e-4]).tolist() == [2, 1, 3, 2]
+    again = tf.Schedule({0: 1.0, 1: 2.0}, period=2.0)
+    assert again([2.0 - 1e-12, 2.0 - 1e-6, 3.0 - 1e-12]).tolist() == [1, 2, 2]
+    assert tf.Schedule({1: 2.0, 0: 1.0})([0.0, 1.0]).tolist() == [1, 2]  # in whichever order
+
+
+def test_what_a_step_takes_at_its_middle_is_not_lost(recwarn):
+    # of steps of 0.2 h one has its middle at 0.3 h, and none begins there
+    short = tf.Schedule({0: 1.0, 0.25: 2.0, 0.35: 3.0})
+    assert short._lost(0.2, 0.5) == [] and short._lost(0.2, 0.0) == [0.25]
+    begins = tf.Schedule({0: 1.0, 0.4: 2.0, 0.45: 3.0})
+    assert begins._lost(0.2, 0.0) == [] and begins._lost(0.2, 0.5) == [0.4]
+    last = tf.Schedule({0: 1.0, 0.9: 2.0})
+    assert last._lost(0.4, 0.0) == [] == last._lost(0.4, 0.5)
+    assert tf.Schedule({0: 1.0, 0.9: 2.0}, period=1.0)._lost(0.4, 0.0) == [0.9]
+    last.warn_of_step("dose", 0.3)
+    assert not recwarn.list
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [

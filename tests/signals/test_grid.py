@@ -39,6 +39,14 @@ def test_what_a_grid_says_of_itself(device):
     assert g.centres()[23].tolist() == [1.0, -1.5, -0.25]
 
 
+def test_grids_are_alike_where_all_their_voxels_are():
+    one = grid([(3, 2, 4), (1, 1, 1)])
+    assert one.alike(grid([(3, 2, 4), (1, 1, 1)]))
+    assert not one.alike(grid([(3, 2, 4), (1, 2, 1)]))
+    assert not one.alike(grid([(3, 2, 4), (1, 1, 1)], spacing=(2.0, 1.0, 1.0)))
+    assert not one.alike(Grid(one.origin + 1.0, one.shape, SPACING))
+
+
 def test_grids_of_one_shape_are_a_plain_view(device):
     g = grid([(3, 2, 4)] * 3, device)
     values = field(g)

@@ -137,6 +137,20 @@ def test_the_stencil_knows_height_mask_and_period(dtype):
     assert held.outside.tolist() == [False, True, True]
 
 
+def test_a_cell_beyond_the_box_meets_the_reservoir_of_its_own_colony():
+    """As the ids of colonies say, and not their places. In an obstacle there is nothing."""
+    layout = Layout(
+        grid(), periodic=(False, False, True), obstacle=lambda at: at[:, 0] < -4.0,
+        reservoir={"a": torch.tensor([1.0, 2.0, 4.0, 8.0])},
+    )  # fmt: skip
+    position = torch.tensor([[1.0, 1.0], [9.0, 1.0], [-7.0, 5.0], [9.0, 5.0], [50.0, 1.0]])
+    colony, ids = torch.tensor([0, 0, 1, 1, 2]), torch.tensor([3, 0, 2])
+    values = {"a": torch.full((layout.grid.nodes,), 0.5)}
+    found = layout.contact(position.double(), colony, ids, values, torch.float32)
+    assert found.found["a"].tolist() == [0.5, 8.0, 0.0, 1.0, 4.0]
+    assert found.in_reservoir.tolist() == [False, True, False, True, True]
+
+
 def test_a_state_on_another_grid_is_not_continued_silently():
     """Its signals would stay on the grid that they were begun on."""
 
