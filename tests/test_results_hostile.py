@@ -183,10 +183,15 @@ def change(name, value):
     return spoil
 
 
+def the_last_number_is_free(file):
+    change("frames/next_uid", file["cells/uid"][last_rows(file)].max())(file)
+
+
 @pytest.mark.parametrize(
     "spoil, words",
     [
         (change("frames/next_uid", 0), "the numbers of new cells would be those of cells"),
+        (the_last_number_is_free, "the numbers of new cells would be those of cells"),
         (change("cells/uid", 3), "two cells of a colony have one number"),
         (change("cells/colony", 1), "its cells are not those that its colonies count"),
         (change("cells/position", np.inf), "is not finite"),
@@ -203,6 +208,14 @@ def test_no_run_goes_on_from_a_frame_that_makes_no_sense(copy, spoil, words):
         spoil(file)
     with tf.Results(copy) as results, pytest.raises(tf.InputError, match=f"in frame .*{words}"):
         results.state(scene)
+
+
+def test_a_run_goes_on_from_cells_without_a_cylinder(copy):
+    with h5py.File(copy, "a") as file:
+        change("cells/length", 0.0)(file)
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2))
+    with tf.Results(copy) as results:
+        assert results.state(scene).length.max() == 0.0
 
 
 READER = """

@@ -432,6 +432,23 @@ def test_what_does_not_fit_a_periodic_space_is_refused():
         scene.bind(cells=tf.Cells(position=[[1.0, 0.0]], axis=[[0.0, 1.0]], length=20.0))
 
 
+def test_a_space_knows_its_shortest_period_and_both_faces():
+    space = PeriodicSpace.of("periodic", {"x": (0.0, 10.0), "y": (0.0, 30.0)}, 3)
+    assert space.shortest == 10.0 and space.period == (10.0, 30.0, 0.0)
+    long = space.too_long(
+        torch.tensor([3.5, 3.5, 4.5]), torch.full((3,), 0.5), torch.tensor([0.0, 1.0, 0])
+    )
+    assert long.tolist() == [False, True, True]
+    places = [[0.0, 0, 0], [10.0, 30, 99], [-0.1, 1, 1], [10.1, 1, 1], [1, -0.1, 1], [1, 30.1, 1]]
+    assert space.outside(torch.tensor(places)).tolist() == [False] * 2 + [True] * 4
+
+
+def test_a_wall_that_ends_space_in_one_colony_does_not_fit():
+    wall = tf.Plane(point=[[0.0, -5.0]] * 2, normal=[[0.0, 1.0], [1.0, 1.0]])
+    with pytest.raises(tf.InputError, match="the Plane ends space along x"):
+        tf.Mechanics(dim=2, periodic={"x": (0, 40)}, walls=[wall])
+
+
 def medium(x: tuple[float, float], *, periodic: bool) -> tf.Medium:
     faces = tf.BoundaryConditions(x=tf.Periodic()) if periodic else None
     box = (x[0], -20.0), (x[1], 20.0)

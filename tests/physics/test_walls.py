@@ -370,6 +370,12 @@ def test_walls_that_make_no_sense_are_refused(make):
         make()
 
 
+def test_a_wall_yields_where_it_does_so_in_one_colony():
+    made = lambda **options: tf.Plane(y=0, facing="+y", **options).yields
+    assert made(weight=[1.0, 0.5]) and made(weight=0.5) and made(stiffness=10.0)
+    assert not made() and not made(weight=1.0) and not made(weight=[1.0, 1.0])
+
+
 @pytest.mark.parametrize("where", [4.0, [4.0, 5.0]])
 def test_a_tensor_that_turns_a_wall_inside_out_is_refused_in_the_next_step(where):
     """As an optimiser may, which changes tensors in place."""
