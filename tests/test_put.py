@@ -240,12 +240,3 @@ def test_a_recording_refuses_colonies_of_another_course(tmp_path):
             [*tf.simulate(scene, mixed, until=3.0, record=tf.Recorder(path, scene, append=True))]
     *_, end = tf.simulate(scene, last, until=3.0, record=tf.Recorder(path, scene, append=True))
     assert end.time == pytest.approx(3.0)
-
-
-def test_a_recording_knows_cells_that_are_removed_by_hand(tmp_path):
-    scene = scene_of()
-    states = tf.simulate(scene, colonies=3, seed=1, until=3.0, record=tmp_path / "run.h5")
-    for state in states:
-        if state.step == 40:
-            states.send(state.remove(state.uid % 2 == 1, "removed"))
-    assert tf.Results(tmp_path / "run.h5").lineage()

@@ -66,9 +66,7 @@ def inoculum(
     )
     lengths = _lengths(length, kinds, shares, seed)
     radii = _of_each("cell_radius", cell_radius, kinds, shares, above=0.0)
-    if extra is not None and not isinstance(extra, Mapping):
-        raise checks.input_error("extra", extra, 'numbers by name, such as {"plasmids": 4}')
-    more = {n: _of_each(f"extra[{n!r}]", x, kinds, shares) for n, x in (extra or {}).items()}
+    more = _variables({} if extra is None else extra, kinds, shares)
     if floor is not None:
         checks.number("floor", floor)
         if dim == 2:
@@ -99,6 +97,15 @@ def _by_type(name: str, given: Mapping[int, Any], shares: Mapping[int, float] | 
         hint = "Give their shares, such as types={0: 0.9, 1: 0.1}."
         rule = "one number where there are no types" if shares is None else rule
         raise checks.input_error(name, dict(given), rule, hint if shares is None else "")
+
+
+def _variables(
+    given: Any, kinds: np.ndarray, shares: Mapping[int, float] | None
+) -> dict[str, np.ndarray]:
+    """The variables of each cell by name, of the shape of their `kinds`, checked."""
+    if not isinstance(given, Mapping):
+        raise checks.input_error("extra", given, 'numbers by name, such as {"plasmids": 4}')
+    return {name: _of_each(f"extra[{name!r}]", x, kinds, shares) for name, x in given.items()}
 
 
 def _of_each(

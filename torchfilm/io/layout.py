@@ -157,6 +157,9 @@ def write_rows(table: h5py.Dataset, at: int, value: np.ndarray) -> None:
     """Make these the last rows of a dataset, from `at` on. By HDF5's own functions: those of h5py
     take longer than the rows of a small frame."""
     value = np.ascontiguousarray(value)
+    if value.shape[1:] != table.shape[1:]:  # HDF5 would cut off what is already there
+        rule = f"has rows of the shape {table.shape[1:]}, not {value.shape[1:]}"
+        raise ValueError(f"{table.name} {rule}")
     table.id.set_extent((at + len(value), *value.shape[1:]))
     if value.size:
         place = table.id.get_space()

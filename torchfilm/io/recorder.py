@@ -13,6 +13,15 @@ import numpy as np
 import torch
 
 from torchfilm.io import replacing
+from torchfilm.io.events import (
+    Rows,
+    absent_from,
+    births_of,
+    check_course,
+    ends_of,
+    removed,
+    removed_before,
+)
 from torchfilm.io.identity import scene_attributes
 from torchfilm.io.layout import (
     AT_CELLS,
@@ -39,12 +48,13 @@ from torchfilm.io.results import Results
 from torchfilm.io.room import SPARE_BYTES, check_room, free_bytes
 from torchfilm.model import Model
 from torchfilm.scene import Scene
-from torchfilm.state import FATES, State
+from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.checks import SimulationError
 from torchfilm.tools.whole_files import why_not_written
 from torchfilm.version import __version__
 
+NOBODY: Rows = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64))
 # Suffixes of formats that a run might be thought to write: such a name would mislead.
 OF_OTHERS = (".csv", ".tsv", ".json", ".txt", ".xml")
 
@@ -82,8 +92,10 @@ class Recorder(metaclass=checks.KnownKeywords):
         self.model: Model | None = None
         self.first_step = 0
         self.tables: dict[str, h5py.Dataset] = {}
-        self.births: list[tuple[np.ndarray, ...]] = []
-        self.ends: list[tuple[np.ndarray, ...]] = []
+        # events since the last frame that is written
+        self.births: list[Rows] = []
+        self.ends: list[Rows] = []
+        self.absent = NOBODY  # cells of the last frame that the state which resumes it lacks
         self.last: State | None = None
         self.written = -1
 
@@ -132,12 +144,15 @@ class Recorder(metaclass=checks.KnownKeywords):
 
     def __call__(self, state: State) -> None:
         if self.file is not None and self.last is not None:
-            _check_course(self.last, state)  # the file ends with the last state before
-        self.last = state
+            check_course(self.last, state)  # the file ends with the last state before
+        before, self.last = self.last, state
         if self.file is None:
             self._open(state)  # earlier events belong to no frame of this run
             return
-        self._note_events(state)
+        by_hand = [] if before is None else removed_before(state, before)
+        self.births += births_of(state)
+        self.ends += [*removed(state, self.absent), *by_hand, *ends_of(state)]
+        self.absent = NOBODY
         if (state.step - self.first_step) % self.every == 0:
             self._write(state)
 
@@ -161,6 +176,7 @@ class Recorder(metaclass=checks.KnownKeywords):
     def _open(self, state: State) -> None:
         """Make the new file, complete with a frame, under another name; then put it in place."""
         self._check_still_free()
+        self.births, self.ends, self.absent = [], [], NOBODY
         try:
             with ExitStack() as hold:
                 if self.append:
@@ -230,6 +246,7 @@ class Recorder(metaclass=checks.KnownKeywords):
         """A copy of the file, which ends with this state."""
         with Results(self.path) as kept:
             self._check_resumed(kept, state)
+            self.absent = absent_from(state, kept.frame(), kept.colony_id)
             self.written, self.first_step = int(kept.steps[-1]), int(kept.steps[0])
         check_room(
             self.target, self.target.stat().st_size, f"to resume {self.path}, by a copy of it",
@@ -238,7 +255,8 @@ class Recorder(metaclass=checks.KnownKeywords):
         self.file = replacing.create_file(self.source)
         replacing.copy_committed(self.target, self.file)
         # with `changed`, the scene may be another one
-        for name, value in {**scene_attributes(self.scene, self.model), "dt": self.dt}.items():
+        ours = {**scene_attributes(self.scene, self.model), "dt": self.dt, "every": self.every}
+        for name, value in ours.items():
             self.file.attrs[name] = value
         about = self.scene, state.colony_id, state.step
         write_parameters(self.file, *about, changed=self.changed)
@@ -290,6 +308,16 @@ class Recorder(metaclass=checks.KnownKeywords):
                 "state", "with other cells", f"of cells of the last frame of {self.path}",
                 "Record to a file of its own.",
             )  # fmt: skip
+        for scope, columns in ("cells", cell_columns), ("frames/colony", colony_columns):
+            recorded, own = set(kept.file.get(scope, ())), set(columns(state))
+            if other := sorted(recorded ^ own):
+                has = "lacks" if other[0] in recorded else "has"
+                raise checks.input_error(
+                    "state",
+                    f"one that {has} the field {other[0]!r}",
+                    f"one with the fields of {self.path}",
+                    "Start from its last frame, or record to a file of its own.",
+                )
         last = int(kept.steps[-1])
         if last != state.step:
             raise checks.input_error(
@@ -298,21 +326,6 @@ class Recorder(metaclass=checks.KnownKeywords):
                 f"the last frame of {self.path}, at step {last}",
                 "Start from its last frame.",
             )
-
-    def _note_events(self, state: State) -> None:
-        """Keep the births and ends of a step until the next frame is written."""
-        for b in state.births:
-            parents = torch.cat([b.parents.uid, b.parents.uid])
-            ids = torch.cat([b.parents.own_colony_id, b.parents.own_colony_id])
-            steps, times = (np.full(parents.numel(), x) for x in (state.step, state.time))
-            own = (numpy_of(x) for x in (ids, b.uid, parents))
-            self.births.append((*own, steps, numpy_of(b.length), times))
-        for e in state.ended:
-            steps, times = (np.full(e.uid.numel(), x) for x in (state.step, state.time))
-            fates = np.full(e.uid.numel(), FATES.index(e.fate))
-            own = (numpy_of(x) for x in (e.colony_id, e.uid))
-            types = np.full_like(steps, -1) if e.cell_type is None else numpy_of(e.cell_type)
-            self.ends.append((*own, steps, fates, numpy_of(e.length), times, types))
 
     def _write(self, state: State) -> None:
         assert self.file is not None
@@ -418,20 +431,3 @@ class Recorder(metaclass=checks.KnownKeywords):
             self._append(f"frames/{name}", np.asarray(row[name])[None], frame)
         file.flush()
         self.births, self.ends = [], []
-
-
-def _check_course(before: State, state: State) -> None:
-    """Raise InputError where colonies have cells that were neither there a step ago, nor born in
-    this step: the lineage would lead nowhere."""
-    if not torch.equal(before.colony_id, state.colony_id):
-        return
-    born = sum(b.parents.groups.counts for b in state.births)
-    strange = state.next_uid != before.next_uid + 2 * born
-    if not bool(strange.any()):
-        return
-    names = ", ".join(map(str, state.colony_id[strange].tolist()[:5]))
-    raise checks.InputError(
-        f"colony {names} has other cells at step {state.step} than a step ago and their daughters,"
-        " as after state.put. A file of results knows one course of each colony: end this run, and"
-        " record what follows to a file of its own."
-    )

@@ -1,0 +1,101 @@
+"""What happens to cells between the states that a recorder sees, as rows of `/lineage`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfilm.io.layout import numpy_of
+from torchfilm.state import FATES, State
+from torchfilm.tools import checks
+
+Rows = tuple[np.ndarray, ...]  # the columns of `layout.LINEAGE`, in their order
+
+
+def births_of(state: State) -> list[Rows]:
+    """The births of a step."""
+    found = []
+    for b in state.births:
+        parents = torch.cat([b.parents.uid, b.parents.uid])
+        ids = torch.cat([b.parents.own_colony_id, b.parents.own_colony_id])
+        steps, times = (np.full(parents.numel(), x) for x in (state.step, state.time))
+        own = (numpy_of(x) for x in (ids, b.uid, parents))
+        found.append((*own, steps, numpy_of(b.length), times))
+    return found
+
+
+def ends_of(state: State) -> list[Rows]:
+    """The ends of a step."""
+    return [_rows(state, e.fate, e.colony_id, e.uid, e.length, e.cell_type) for e in state.ended]
+
+
+def removed_before(state: State, before: State) -> list[Rows]:
+    """The ends of cells that were taken out since the state before the step, by hand: they are not
+    there, and did not end in the step."""
+    ended = sum(e.uid.numel() for e in state.ended)
+    born = sum(b.uid.numel() for b in state.births)
+    if state.cells == before.cells + born - ended:
+        return []
+    there = _keys([(state.own_colony_id, state.uid), *((e.colony_id, e.uid) for e in state.ended)])
+    own = zip(before.own_colony_id.tolist(), before.uid.tolist(), strict=True)
+    gone = torch.tensor([key not in there for key in own], device=before.device)
+    e = before.noted_end(torch.nonzero(gone).squeeze(1), "removed")
+    return [_rows(state, e.fate, e.colony_id, e.uid, e.length, e.cell_type)]
+
+
+def absent_from(state: State, frame: Mapping[str, np.ndarray], ids: np.ndarray) -> Rows:
+    """The cells of a recorded frame that a state of its step lacks: ids of colonies, uids, lengths
+    and types. ids: of the colonies of the frame."""
+    there = _keys([(state.own_colony_id, state.uid)])
+    colony, uid = ids[frame["colony"]], frame["uid"]
+    gone = np.array([key not in there for key in zip(colony.tolist(), uid.tolist(), strict=True)])
+    kind = frame.get("cell_type", np.full_like(uid, -1))
+    return tuple(x[gone.astype(bool)] for x in (colony, uid, frame["length"], kind))
+
+
+def removed(state: State, absent: Rows) -> list[Rows]:
+    """The ends of such cells, in the first step after."""
+    ids, uid, length, kind = (torch.from_numpy(x) for x in absent)
+    return [_rows(state, "removed", ids, uid, length, kind)] if len(uid) else []
+
+
+def _rows(
+    state: State, fate: str, ids: Tensor, uid: Tensor, length: Tensor, cell_type: Tensor | None
+) -> Rows:
+    count = uid.numel()
+    steps, fates, times = (np.full(count, x) for x in (state.step, FATES.index(fate), state.time))
+    types = np.full(count, -1) if cell_type is None else numpy_of(cell_type)
+    return numpy_of(ids), numpy_of(uid), steps, fates, numpy_of(length), times, types
+
+
+def _keys(parts: Iterable[tuple[Tensor, Tensor]]) -> set[tuple[int, int]]:
+    return {key for ids, uid in parts for key in zip(ids.tolist(), uid.tolist(), strict=True)}
+
+
+def check_course(before: State, state: State) -> None:
+    """Raise InputError where colonies are others than a step ago, or have cells that were neither
+    there, nor born in this step: the lineage would lead nowhere."""
+    if not torch.equal(before.colony_id, state.colony_id):
+        raise checks.InputError(
+            f"the run has the colonies {_listed(state.colony_id)} at step {state.step}, and had"
+            f" {_listed(before.colony_id)} before, as after state.select. All frames of a file of"
+            " results have the same colonies: record what each colony does to a file of its own, or"
+            " remove the cells of those that are done (state.remove)."
+        )
+    born = sum(b.parents.groups.counts for b in state.births)
+    strange = state.next_uid != before.next_uid + 2 * born
+    if not bool(strange.any()):
+        return
+    raise checks.InputError(
+        f"colony {_listed(state.colony_id[strange])} has other cells at step {state.step} than a"
+        " step ago and their daughters, as after state.put. A file of results knows one course of"
+        " each colony: end this run, and record what follows to a file of its own."
+    )
+
+
+def _listed(ids: Tensor) -> str:
+    found = ids.tolist()
+    return ", ".join(map(str, found[:5])) + (", …" if len(found) > 5 else "")
