@@ -288,3 +288,51 @@ def test_descriptions_with_keywords_of_their_own_can_be_replaced():
             wrong()
     with pytest.raises(tf.InputError, match="k = -inf"):
         replace(circuit, parameters={"k": -torch.inf})
+
+
+# --- what bind is given by mistake ----------------------------------------------------------------
+
+
+def test_a_state_in_place_of_cells_is_told_where_it_goes():
+    scene = tf.Scene(tf.Growth(rate=1.0), dim=2)
+    with pytest.raises(tf.InputError, match=r"cells = State\(.* a tf.Cells. A state goes on by"):
+        scene.bind(cells=scene.bind().start())
+
+
+def test_streams_of_several_colonies_need_their_number():
+    with pytest.raises(tf.InputError, match=r"streams = \[5, 2, 0\].*Give colonies=3, too"):
+        tf.Scene(tf.Growth(rate=1.0), dim=2).bind(streams=[5, 2, 0])
+
+
+def test_founders_are_made_of_a_seed_alone():
+    two = lambda seed, colony: tf.Cells.single(2)
+    with pytest.raises(tf.InputError, match="a function of one number, the seed of the colony"):
+        tf.Scene(tf.Growth(rate=1.0), founders=two, dim=2)
+
+
+def test_fields_that_are_not_there_are_guessed_at():
+    state = tf.Scene(tf.Rules(variables={"light": 0.0}), dim=2).bind(3).start()
+    with pytest.raises(tf.InputError, match=r"field = 'ligth' .*Did you mean 'light'\?"):
+        state.with_fields(ligth=state.light)
+    with pytest.raises(tf.InputError, match=r"\(5,\) .*x\[state.colony\]"):
+        state.with_fields(light=torch.zeros(5))
+
+
+def test_a_division_has_no_neighbours():
+    def born(parent, first, second):
+        first.crowd = first.contact_count()
+
+    scene = tf.Scene(
+        tf.Rules(None, born, variables={"crowd": 0.0}), tf.Growth(rate=1.0),
+        tf.Division(length=4.0), dim=2,
+    )  # fmt: skip
+    with pytest.raises(tf.InputError, match="daughter1 has no 'contact_count': a division sees"):
+        scene.bind()
+
+
+def test_a_schedule_as_the_rate_of_a_reaction_is_told_its_place():
+    made = tf.parts.constitutive("m", tf.Schedule({0: 1.0, 1: 2.0}))
+    with pytest.raises(tf.InputError, match=r"Name a constant, rate='light', and give it"):
+        tf.Circuit(made, species="m")
+    with pytest.raises(tf.InputError, match="What changes in time is a Schedule"):
+        tf.Circuit(tf.parts.constitutive("m", "light"), species="m", light=lambda t: 1.0)

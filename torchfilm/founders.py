@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -44,6 +45,14 @@ def one_draw(draw: Draw, seed: int, like: Cells | None = None) -> Cells:
     """What `draw` makes of a seed. Raises InputError unless it is cells of one colony, with the
     columns of others."""
     name = f"founders({seed})"
+    try:
+        inspect.signature(draw).bind(seed)
+    except TypeError as error:
+        rule = "a function of one number, the seed of the colony"
+        hint = "What else differs between colonies is a value per colony, or a scene of its own."
+        raise checks.input_error("founders", draw, rule, hint) from error
+    except ValueError:  # of a function that does not say what it takes
+        pass
     made = draw(seed)
     if not isinstance(made, Cells):
         raise checks.input_error(name, made, "Cells, such as tf.inoculum(12, 10.0, seed=seed)")

@@ -354,6 +354,9 @@ def bind(
     after_fork()
     if state is not None:
         return _bind_to_state(scene, state, only)
+    if cells is not None and not isinstance(cells, Cells):
+        hint = "A state goes on by bind(state=…)." if isinstance(cells, State) else ""
+        raise checks.input_error("cells", cells, "a tf.Cells", hint)
     founders = cells if cells is not None else scene.founders
     count = _count(scene, colonies, founders, only)
     seed = checks.integer("seed", seed, least=0, most=2**63 - 1)
@@ -415,7 +418,10 @@ def _streams(given: Sequence[int] | Tensor | None, colonies: int) -> Tensor | No
     integers = not (found.is_floating_point() or found.dtype == torch.bool)
     if found.shape != (colonies,) or not integers or bool(((found < 0) | (found >= 2**32)).any()):
         raise checks.input_error(
-            "streams", given, f"{colonies} integers from 0 to 2³² − 1, one for each colony"
+            "streams",
+            given,
+            f"{colonies} integers from 0 to 2³² − 1, one for each colony",
+            f"Give colonies={len(found)}, too." if colonies == 1 < found.numel() else "",
         )
     return found.to(torch.int64)
 

@@ -74,7 +74,9 @@ def as_tensor(name: str, value: Any, device: torch.device) -> Tensor:
     try:
         return value if isinstance(value, Tensor) else torch.as_tensor(value, device=device)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise RuleError(f"{name} was set to {value!r}: it must be a number or a tensor.") from error
+        raise RuleError(
+            f"{name} = {value!r} is not allowed: it must be a number or a tensor."
+        ) from error
 
 
 def broadcast_copy(name: str, tensor: Tensor, dtype: torch.dtype, shape: Sequence[int]) -> Tensor:

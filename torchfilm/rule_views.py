@@ -341,6 +341,11 @@ class DivisionView(Draws):
                 return self.position[:, AXES.index(name)]
             if not (name in GEOMETRY or name in IDENTITY or name in self._state.fields):
                 known = _known_names(self._state)
+                if hasattr(CellsView, name):
+                    raise RuleError(
+                        f"{self._name} has no {name!r}: a division sees its own cells. Let update"
+                        " set a variable of them, which divide reads."
+                    )
                 raise RuleError(
                     f"cells have no {name!r}; they have {', '.join(known)}.{near_name(name, known)}"
                 )

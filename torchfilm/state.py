@@ -246,11 +246,13 @@ class State:
 
     def with_fields(self, **values: Tensor) -> State:
         """A state with some of its fields replaced; each must have been declared."""
-        if not values.keys() <= self.declared.keys():
+        if unknown := sorted(values.keys() - self.declared.keys()):
+            own = [name for name, field in self.declared.items() if not field.internal]
             raise checks.input_error(
                 "field",
-                sorted(values.keys() - self.declared.keys()),
-                f"declared: {', '.join(self.declared) or 'none'}; parts have replace(position=…)",
+                unknown[0],
+                f"declared: {', '.join(own) or 'none'}; parts have replace(position=…)",
+                checks.suggestion(unknown[0], own),
             )
         row_checks.check_tensors(values, self.fields, self.device, self._shape_of)
         return self.replace(fields={**self.fields, **values})

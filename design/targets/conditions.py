@@ -24,6 +24,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+OF_NUMBERS = (
+    "The scene function gets one number per colony, and makes of it what it stands for, such as a"
+    " value of a schedule, tf.Schedule({0: early, 2: late})."
+)
+
+
 @dataclass(frozen=True)
 class Conditions(SumOfTargets):
     """A design that does something else under each of several conditions, such as a gate:
@@ -61,7 +67,7 @@ class Conditions(SumOfTargets):
                     " each condition must name the same arguments of the scene."
                 )
             for name, value in given.items():
-                checks.number(f"Conditions.terms[{k}]: {name}", value)
+                checks.number(f"Conditions.terms[{k}]: {name}", value, hint=OF_NUMBERS)
             of_colonies("Conditions", part)
         found = [tuple(float(given[n]) for n in names) for given, _ in terms]
         if len(set(found)) < len(found):

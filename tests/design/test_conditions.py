@@ -297,3 +297,16 @@ def test_trivial_answers_are_under_all_conditions():
 
 def torch_dark(state: tf.State) -> tf.State:
     return state.with_fields(gfp=torch.zeros_like(state.gfp))
+
+
+def test_what_takes_one_plain_number_is_no_condition():
+    def crowd(n=20):
+        founders = lambda seed: tf.inoculum(n, 15.0, seed=seed)
+        return tf.Scene(tf.Growth(rate=1.0), founders=founders, dim=2, dt=0.1)
+
+    cells = Measured({"cells": lambda s: s.counts.double()}, {"cells": 9.0}, {"cells": 1.0})
+    several = Conditions([({"n": 10}, cells), ({"n": 40}, cells)])
+    with pytest.raises(tf.InputError, match=r"how many founders .*Conditions, arrive as a tensor"):
+        Task(lambda n=20, k=1.0: crowd(n), [Parameter("k", 0.5, 2.0)], several, until=0.2)
+    with pytest.raises(tf.InputError, match="makes of it what it stands for, such as a value of a"):
+        Conditions([({"light": tf.Schedule({0: 1.0})}, cells), ({"light": 1.0}, cells)])

@@ -140,3 +140,47 @@ PROTEIN = tf.Circuit(lambda u, s, p, cell: {"p": -u.p}, species="p")
 def test_what_is_refused(build, said):
     with pytest.raises(tf.InputError, match=said):
         build()
+
+
+# --- variables alone ------------------------------------------------------------------------------
+
+
+def lit(rules) -> tf.Scene:
+    rates = lambda u, s, p, cell: {"gfp": 2.0 * cell.light - u.gfp}
+    return tf.Scene(
+        rules, tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics(dim=2),
+        tf.Circuit(rates, species="gfp"), dt=0.1,
+    )  # fmt: skip
+
+
+def shone_on(step, state) -> tf.State:
+    """A loop of control, from outside."""
+    for _ in range(20):
+        level = state.groups.sum(state.gfp) / state.counts
+        state = step(state.with_fields(light=(1.0 - level).clamp(min=0.0)[state.colony]))
+    return state
+
+
+def test_variables_without_functions_are_set_from_outside():
+    """They are those of a rule that does nothing, and follow recorded growth."""
+    scene, empty = (
+        lit(tf.Rules(variables={"light": 0.5})),
+        tf.Rules(lambda cells: None, variables={"light": 0.5}),
+    )
+    model, other = scene.bind(2), lit(empty).bind(2)
+    assert (model.start().light == 0.5).all()
+    found = shone_on(lambda s: model.step(s, dt=0.1), model.start())
+    plain = shone_on(lambda s: other.step(s, dt=0.1), other.start())
+    assert found.cells > 2 and (found.gfp > 0.1).all() and torch.equal(found.gfp, plain.gfp)
+    assert model.why_not_replayable == "" and "rules may read" in other.why_not_replayable
+    replay = tf.Replay(model, tf.GrowthRecording(scene, streams=range(2), seed=0))
+    again = shone_on(replay.step, model.start())
+    assert torch.equal(again.gfp, found.gfp) and torch.equal(again.uid, found.uid)
+    assert "your own Python" not in tf.explain(scene, seconds=0)
+
+
+def test_rules_without_functions_and_variables_do_nothing():
+    with pytest.raises(tf.InputError, match=r"neither update nor divide.*or variables"):
+        tf.Rules(parameters={"k": 1.0})
+    with pytest.raises(tf.InputError, match=r"extra=\{'plasmids': \{0: 4, 1: 0\}\}"):
+        tf.Rules(variables={"plasmids": {0: 4, 1: 0}})

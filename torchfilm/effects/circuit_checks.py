@@ -102,6 +102,12 @@ def check_rates(by_type: Mapping[int | str, Any], typed: bool) -> None:
     for kind, part in by_type.items():
         if typed and (isinstance(kind, bool) or not isinstance(kind, Integral)):
             raise checks.input_error("Circuit.rates", kind, "by cell types that are integers")
+        reactions = part if isinstance(part, (list, tuple)) else ()
+        for one in reactions:
+            if isinstance(one, Reaction) and isinstance(one.rate, Schedule):
+                rule = "a number, a name of a constant, or a function (u, s, p, cell)"
+                hint = "Name a constant, rate='light', and give it: Circuit(…, light=schedule)."
+                raise checks.input_error(f"rate of Reaction {one}", one.rate, rule, hint)
         if not callable(part) and not (isinstance(part, (list, tuple)) and part):
             raise checks.input_error(
                 "Circuit.rates",
@@ -147,6 +153,8 @@ def check_constants(given: Mapping[str, Any], options: Sequence[str]) -> None:
         function = callable(value) and not isinstance(value, Schedule)
         if isinstance(value, str) or function or (near and by_names):
             hint = f"Did you mean {near}?" if near else FORMS
+            if function and not near:
+                hint += " What changes in time is a Schedule, or in place a rate of cell.x."
             allowed = "a constant of the rates, as further keywords are"
             raise checks.input_error(f"Circuit.{name}", value, allowed, hint)
 

@@ -39,7 +39,8 @@ class Rules(Effect):
     daughter2)` after divisions.
 
     update: a function, or the path of a Python file that defines `update` and optionally `divide`.
-    variables: initial values of the user's own variables, one number each. parameters: constants
+    variables: initial values of the user's own variables, one number each; without functions, those
+    that only `state.with_fields` sets, from outside of the run. parameters: constants
     that rules read as `cells.p.k` (`parent.p.k`, …), one value for each cell: a number, one per
     colony, one per cell type, a distribution drawn at birth, or a Schedule.
     """
@@ -54,7 +55,6 @@ class Rules(Effect):
 
     stage = RULES
     title = "rules"
-    writes_anything = True
 
     def __post_init__(self) -> None:
         path, stamp = None, (0, 0)
@@ -75,10 +75,10 @@ class Rules(Effect):
         for name, given in functions.items():
             if given is not None and not callable(given):
                 raise checks.input_error(f"Rules.{name}", given, "a function")
-        if not any(functions.values()):
+        if not any(functions.values()) and not self.variables:
             raise checks.InputError(
                 "Rules() has neither update nor divide: give at least one, such as"
-                " tf.Rules(update)."
+                " tf.Rules(update); or variables, which state.with_fields sets."
             )
         for name, value in self.variables.items():
             if name == "remove_flag":
@@ -90,12 +90,19 @@ class Rules(Effect):
                     value,
                     f"left to {OF_EFFECTS[name]}, which has it: list that beside Rules",
                 )
-            checks.number(f"Rules.variables[{name!r}]", value)
+            shown = f"{{{name!r}: {value!r}}}"
+            hint = f"Founders have one by type: tf.inoculum(…, types=…, extra={shown})."
+            by_type = isinstance(value, Mapping)
+            checks.number(f"Rules.variables[{name!r}]", value, hint=hint if by_type else "")
         constants = checked_constants("Rules", self.parameters, CONSTANT)
         object.__setattr__(self, "parameters", constants)
         object.__setattr__(self, "path", path)
         object.__setattr__(self, "functions", functions)
         object.__setattr__(self, "stamp", stamp)
+
+    @property
+    def writes_anything(self) -> bool:  # type: ignore[override]
+        return any(self.functions.values())
 
     def __reduce__(self) -> tuple[Any, ...]:
         # unpickling reads a rules file again
@@ -131,7 +138,8 @@ class Rules(Effect):
         return tuple(Field(name, MEANING, initial=value) for name, value in self.variables.items())
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        return ["your own Python, once a step on whole tensors"]
+        own = any(self.functions.values())
+        return ["your own Python, once a step on whole tensors"] if own else []
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         source = HotReload(self.path, dict(self.functions), self.stamp)

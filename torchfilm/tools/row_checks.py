@@ -158,7 +158,10 @@ def check_tensors(
             continue
         if value.shape != now.shape and tuple(value.shape) != (wanted := tuple(shape(name))):
             rule = f"{wanted}, one value for each cell, colony or voxel first"
-            raise checks.input_error(f"shape of the field {name!r}", tuple(value.shape), rule)
+            hint = "Numbers of colonies come to their cells by x[state.colony]."
+            hint = hint if len(wanted) == value.dim() == 1 else ""
+            shown = tuple(value.shape)
+            raise checks.input_error(f"shape of the field {name!r}", shown, rule, hint)
         if name.startswith("out.") and value.dtype != now.dtype:
             hint = f"Convert it: value.to({now.dtype})."
             raise checks.input_error(
