@@ -427,3 +427,42 @@ def test_before_the_first_time_the_first_value_holds():
     assert light(np.array([-5.0, -1e-12, 0.0, 0.99, 1.0, 2.5])).tolist() == [0.5] * 4 + [1.0, 3.0]
     again = tf.Schedule({0: 0.5, 1: 1.0}, period=2.0)
     assert again([-2.0, -1.5, -1.0, -0.5]).tolist() == [0.5, 0.5, 1.0, 1.0]
+
+
+# --- light: a signal that does not spread ---------------------------------------------------------
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.7, [0.0, 30.0], 1e4])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_signal_that_does_not_move_follows_each_source_exactly(decay, dtype):
+    """u' = s(x) − k u in each voxel, with another image in every step."""
+    images = [lambda x, c=c: torch.exp(-0.1 * (x[:, 0] - c) ** 2) for c in (-3.0, 0.0, 5.0)]
+    light = tf.Signal(
+        diffusion=0.0, decay=decay, source=tf.Schedule({0.5 * k: f for k, f in enumerate(images)})
+    )
+    medium = tf.Medium(light=light, box=((-8, -4), (8, 4)), spacing=2.0)
+    scene = tf.Scene(tf.Growth(rate=0.0), medium, dim=2, dt=0.5)
+    state = scene.bind(2, dtype=dtype).start()
+    rate = torch.as_tensor(decay, dtype=torch.float64).expand(2).reshape(2, 1, 1)
+    x = torch.arange(-7.0, 8.0, 2.0, dtype=torch.float64)
+    place = torch.stack([x, 0 * x], 1)
+    expected = torch.zeros(2, 8, 1, dtype=torch.float64)
+    for image in images:
+        state = scene.bind(2, dtype=dtype).step(state, dt=0.5)
+        gained = torch.where(rate > 0, -torch.expm1(-rate / 2) / rate, 0.5)
+        expected = expected * torch.exp(-rate / 2) + gained * image(place).reshape(1, 8, 1)
+    found = state.signals["light"].double().reshape(2, 8, 4)
+    tolerance = 1e-13 if dtype == torch.float64 else 1e-6
+    torch.testing.assert_close(found, expected.expand(2, 8, 4), rtol=tolerance, atol=1e-30)
+
+
+def test_gradients_pass_through_a_decay_where_nothing_moves():
+    decay = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+    light = tf.Signal(diffusion=0.0, decay=decay, source=3.0)
+    medium = tf.Medium(light=light, box=((-8, -4), (8, 4)), spacing=2.0)
+    scene = tf.Scene(tf.Growth(rate=0.0), medium, dim=2, dt=0.25)
+    end = tf.rollout(scene.bind(dtype=torch.float64), until=1.0)
+    (slope,) = torch.autograd.grad(end.signals["light"].mean(), decay)
+    k = 2.0
+    exact = 3.0 * (math.exp(-k) / k - (1 - math.exp(-k)) / k**2)
+    assert float(slope) == pytest.approx(exact, rel=1e-12)

@@ -110,6 +110,8 @@ def check_separable(operator: Operator) -> None:
 def prepare_exponential(operator: Operator, dt: float) -> Exponential:
     """The factors of a step of `dt` hours. Raises InputError if the operator is not separable."""
     check_separable(operator)
+    if all(axis.still for axis in operator.axes):
+        return _still(operator, dt)
     # decay multiplies the factor of the longest axis, which always exists
     carrier = operator.shape.index(max(operator.shape))
     generators = [
@@ -160,6 +162,23 @@ def prepare_exponential(operator: Operator, dt: float) -> Exponential:
         time = torch.where(more, 2 * time, time)
     made = tuple(None if f is None else _rounded(f, operator.dtype) for f in kept(now, time))
     return Exponential(made, None if gained is None else gained.to(operator.dtype))
+
+
+def _still(operator: Operator, dt: float) -> Exponential:
+    """A step in which nothing moves: u ↦ e^(−kΔt) u + (1 − e^(−kΔt))/k · gain."""
+    decay = operator.decay
+    sizes = operator.shape
+    carrier = sizes.index(max(sizes))
+    n, full = sizes[carrier], aligned(sizes[carrier])
+    one = padded(torch.eye(n, dtype=decay.dtype, device=decay.device)[None], full, full)
+    left = torch.exp(-decay * dt).reshape(-1, 1, 1) * one
+    factors = [left.to(operator.dtype) if axis == carrier else None for axis in range(len(sizes))]
+    gained = None
+    if operator.gain is not None:
+        some = torch.where(decay > 0, decay, 1.0)
+        lasting = torch.where(decay > 0, -torch.expm1(-some * dt) / some, dt)
+        gained = (lasting.reshape(-1, 1, 1, 1) * operator.gain).to(operator.dtype)
+    return Exponential(tuple(factors), gained)
 
 
 def _kept(

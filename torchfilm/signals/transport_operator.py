@@ -55,11 +55,16 @@ class Exchange:
         return self.periodic and self.size == 1
 
     @cached_property
+    def still(self) -> bool:
+        """Whether nothing moves along the axis."""
+        return not (tracked(self.up, self.down) or bool(self.up.any() | self.down.any()))
+
+    @cached_property
     def idle(self) -> bool:
         """Whether the axis has one voxel, and no amount leaves or enters through its faces."""
         if self.size > 1 or tracked(self.up, self.down):
             return False
-        return self.periodic or not bool(self.up.any() | self.down.any())
+        return self.periodic or self.still
 
     def out(self) -> Tensor:
         """The rate at which each voxel gives along this axis, 1/h; one layer less than `up`."""
