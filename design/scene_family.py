@@ -250,9 +250,9 @@ def _cannot_be_built(
     hints = " Narrow the bounds." if changed else ""
     if kind or "tensor(" in str(error):
         hints += (
-            " If the scene takes a plain number or a name there, as for how many founders there"
-            " are, use whole=True or a Choice: a Parameter, and a number of Conditions, arrive as a"
-            " tensor with one value per colony."
+            " If the scene takes a plain number or a name there, use whole=True or a Choice: a"
+            " Parameter, and a number of Conditions, arrive as a tensor with one value per colony,"
+            " which cannot say how many founders there are."
         )
     return tf.InputError(
         f"{kind}{str(error).rstrip('.')}. So the scene cannot be built with {changed or values}."

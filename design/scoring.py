@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import TypeVar, cast
 
 import numpy as np
 import torch
@@ -23,6 +23,8 @@ from design.slopes import Slopes, joined
 from design.targets.base import Target
 from design.targets.goals import Goals
 from design.task import Task
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -131,38 +133,63 @@ def _max_colonies(task: Task, values: Sequence[dict[str, Value]], size: float, s
     return 1
 
 
-def run_work_item(task: Task, item: WorkItem, streams: tuple[int, ...], size: float) -> WorkResult:
-    """Grow and score a work item in one batch; in halves where it does not fit into memory, or
-    where the scene refuses one of its designs."""
-    count, replicates = len(item.rows), len(streams)
+def in_halves(
+    item: WorkItem, act: Callable[[WorkItem], T]
+) -> Iterator[tuple[WorkItem, T | Exception]]:
+    """What `act` makes of a work item, or of its halves, one after the other, where it does not fit
+    into memory or where the scene refuses one of its designs: of that one the error."""
+    count = len(item.rows)
     try:
-        return _grow_and_score(task, item, streams, size)
+        yield item, act(item)
+        return
     except (tf.InputError, tf.SimulationError) as error:
         if count == 1:
-            return WorkResult(
-                np.full((1, replicates), task.target.failed),
-                np.zeros((1, replicates), np.int64),
-                {(0, k): str(error) for k in range(replicates)},
-                "",
-                None if item.tangents is None else Slopes.none(replicates, task.space.size),
-            )
+            yield item, error
+            return
     except (MemoryError, RuntimeError) as error:
         if count == 1 or not memory.is_lack_of_memory(error):
             raise
-    half = count // 2
-    first, second = (
-        run_work_item(task, item.take(part), streams, size)
-        for part in (range(half), range(half, count))
-    )
-    moved = {(row + half, k): reason for (row, k), reason in second.reasons.items()}
+    for part in (range(count // 2), range(count // 2, count)):
+        yield from in_halves(item.take(part), act)
+
+
+def run_work_item(task: Task, item: WorkItem, streams: tuple[int, ...], size: float) -> WorkResult:
+    """Grow and score a work item in one batch, or `in_halves`."""
+    act = lambda part: _grow_and_score(task, part, streams, size)
+    parts = [
+        _refused(task, part, len(streams), str(found)) if isinstance(found, Exception) else found
+        for part, found in in_halves(item, act)
+    ]
+    return parts[0] if len(parts) == 1 else _side_by_side(task, parts, len(streams))
+
+
+def _refused(task: Task, item: WorkItem, replicates: int, reason: str) -> WorkResult:
+    """The result of one design that the scene refuses."""
     return WorkResult(
-        np.concatenate([first.losses, second.losses]),
-        np.concatenate([first.cells, second.cells]),
-        first.reasons | moved,
-        first.why_regrown or second.why_regrown,
-        None if first.slopes is None else joined([first.slopes, second.slopes]),
-        np.concatenate([_goals(task, part, replicates) for part in (first, second)]),
-        joined_residuals([(x.residuals, x.losses.shape) for x in (first, second)]),
+        np.full((1, replicates), task.target.failed),
+        np.zeros((1, replicates), np.int64),
+        {(0, k): reason for k in range(replicates)},
+        "",
+        None if item.tangents is None else Slopes.none(replicates, task.space.size),
+    )
+
+
+def _side_by_side(task: Task, parts: list[WorkResult], replicates: int) -> WorkResult:
+    """The results of the parts of a work item as one."""
+    before = [0, *itertools.accumulate(len(part.losses) for part in parts)]
+    reasons = [
+        {(row + first, k): why for (row, k), why in part.reasons.items()}
+        for first, part in zip(before, parts, strict=False)
+    ]
+    slopes = [part.slopes for part in parts if part.slopes is not None]
+    return WorkResult(
+        np.concatenate([part.losses for part in parts]),
+        np.concatenate([part.cells for part in parts]),
+        dict(itertools.chain.from_iterable(found.items() for found in reasons)),
+        next((part.why_regrown for part in parts if part.why_regrown), ""),
+        joined(slopes) if slopes else None,
+        np.concatenate([_goals(task, part, replicates) for part in parts]),
+        joined_residuals([(x.residuals, x.losses.shape) for x in parts]),
     )
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -24,8 +22,9 @@ from design.executors import check_executor
 from design.growing import FailedColony, grow
 from design.parameters import Value
 from design.prior import Prior
+from design.reasons import tally
 from design.region import Region
-from design.scoring import WorkItem, cut_work_items
+from design.scoring import WorkItem, cut_work_items, in_halves
 from design.targets.observed import Observed
 from design.targets.observed_conditions import averaged, checked_data, errors, places
 from design.task import Task
@@ -81,15 +80,8 @@ class Simulations:
         )
 
     def failures(self) -> list[tuple[str, int]]:
-        """The reasons of failures, without their times, and how often each came, most first. Those
-        that differ in numbers alone are one, in the words of the first."""
-        firsts: dict[str, str] = {}
-        counts: Counter[str] = Counter()
-        for words in self.reasons.values():
-            untimed = re.sub(r"^at \S+ h: | at \S+ h$", "", words)
-            kind = re.sub(r"\d+(\.\d+)?(e[+-]?\d+)?", "#", untimed)
-            counts[firsts.setdefault(kind, untimed)] += 1
-        return counts.most_common()
+        """The reasons of failures and how often each came, as `tally` counts them."""
+        return tally(self.reasons.values())
 
 
 def observed_of(task: Task) -> Observed:
@@ -178,19 +170,13 @@ def _simulate_part(task: Task, part: tuple[int, np.ndarray]) -> Simulations:
 def _run_item(
     task: Task, item: WorkItem, first: int
 ) -> Iterator[tuple[int, np.ndarray, float, str]]:
-    """Row, statistics (K,), cells and reason of failure of each design of a work item. A scene that
-    is refused is tried in halves, so that only the designs at fault fail."""
-    try:
-        yield from _grow_item(task, item, first)
-        return
-    except (tf.InputError, tf.SimulationError) as error:
-        if len(item.rows) == 1:
+    """Row, statistics (K,), cells and reason of failure of each design of a work item."""
+    for part, found in in_halves(item, partial(_grow_item, task, first=first)):
+        if isinstance(found, Exception):
             nothing = np.full(len(observed_of(task).values), np.nan)
-            yield item.rows[0], nothing, math.nan, str(error)
-            return
-    half = len(item.rows) // 2
-    for part in (range(half), range(half, len(item.rows))):
-        yield from _run_item(task, item.take(part), first)
+            yield part.rows[0], nothing, math.nan, str(found)
+        else:
+            yield from found
 
 
 @tf.one_torch_thread()

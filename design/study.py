@@ -3,7 +3,6 @@ it had never stopped."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +15,7 @@ from design.data_file import Stamp, stamp
 from design.entries import Entry
 from design.history import history_of, write_csv
 from design.parameters import right_aligned, show_value
+from design.reasons import tally
 from design.study_file import StudyData, read_study, write_study
 from design.study_refusal import refusal
 from torchfilm import checks, displays
@@ -178,16 +178,9 @@ class Study:
         return facts
 
     def failures(self) -> list[tuple[str, int]]:
-        """The reasons of failures and how many colonies each has, the most frequent first.
-
-        Reasons that differ in their numbers only count as one; the first of them is given.
-        """
-        kinds: dict[str, list[str]] = {}
-        for entry in (*self.entries, *self.finals):
-            for reason in entry.reasons.values():
-                kind = re.sub(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", "#", reason)
-                kinds.setdefault(kind, []).append(reason)
-        return [(alike[0], len(alike)) for alike in sorted(kinds.values(), key=len, reverse=True)]
+        """The reasons of failures and how many colonies each has, as `tally` counts them."""
+        entries = (*self.entries, *self.finals)
+        return tally(reason for entry in entries for reason in entry.reasons.values())
 
     def convergence(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """After each batch: colonies simulated, seconds spent and the lowest loss so far (NaN
