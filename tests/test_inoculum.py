@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -185,6 +187,9 @@ def test_types_may_be_numbers_of_cells():
     assert set(tf.inoculum(5, 9.0, types={0: 1, 1: 0}).cell_type) == {0}  # shares
     with pytest.raises(tf.InputError, match=r"sum to the count, 30, .*Their sum is 29"):
         tf.inoculum(30, 15.0, types={0: 3, 1: 26})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tf.inoculum(300, 60.0, types={0: np.uint8(250), 1: np.uint8(50)})
     with pytest.raises(tf.InputError, match=r"types\[0\] = -3"):
         tf.inoculum(30, 15.0, types={0: -3, 1: 33})
 
@@ -208,5 +213,7 @@ def test_variables_may_differ_by_type():
         tf.inoculum(6, 9.0, types={0: 2, 1: 4}, extra={"plasmids": {0: 4}})
     with pytest.raises(tf.InputError, match=r"extra\['plasmids'\]\[1\] = 'few'"):
         tf.inoculum(6, 9.0, types={0: 2, 1: 4}, extra={"plasmids": {0: 4, 1: "few"}})
+    with pytest.raises(tf.InputError, match=r"extra = 3 .*names"):
+        tf.inoculum(6, 9.0, extra={3: 1.0})
     with pytest.raises(tf.InputError, match=r"extra = 4 .*numbers by name"):
         tf.inoculum(6, 9.0, extra=4)

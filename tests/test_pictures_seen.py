@@ -11,6 +11,7 @@ import torch
 import torchfilm as tf
 from torchfilm import pictures
 from torchfilm.pictures import colours
+from torchfilm.pictures.categories import colours_by_number
 from torchfilm.pictures.colours import PlotStyle
 from torchfilm.pictures.frames import RecordedFrames, _solid, frame_of
 
@@ -250,8 +251,19 @@ def test_cells_of_a_file_have_the_colours_of_their_founders(tmp_path):
         for colour, uid in zip(end["founder"], end["uid"], strict=True):
             assert own[tuple(colour)] == [uid, *tree.ancestors(int(uid), place)][-1]
     tf.pictures.strip(tmp_path / "run.h5", colour="founder", out=tmp_path / "strip.png")
-    with pytest.raises(tf.InputError, match=r"'founder' .* A state does not know the lines"):
+    with pytest.raises(tf.InputError, match=r"'founder' .* a state does not know the lines"):
         tf.show(state, colour="founder")
+
+
+def test_sixty_founders_look_different():
+    found = colours_by_number(np.arange(60))
+    assert np.allclose(found[:8], [matplotlib.colors.to_rgb(c) for c in colours.KINDS])
+    gaps = apart(found, np.eye(3))[np.triu_indices(60, 1)]
+    assert gaps.min() > 8.0
+    some = np.array([70, 3, 3, -1, 25])
+    assert np.array_equal(colours_by_number(some)[1], found[3])  # by its number alone
+    assert np.array_equal(colours_by_number(some)[4], found[25])
+    assert colours_by_number(np.empty(0, np.int64)).shape == (0, 3)
 
 
 def test_a_quantity_that_is_called_founder_is_drawn_as_it_is(tmp_path):

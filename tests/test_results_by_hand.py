@@ -184,3 +184,20 @@ def test_a_run_that_resumes_at_another_pace_says_so(tmp_path):
     with tf.Results(path) as results:
         assert int(results.attributes["every"]) == 5
         assert results.steps.tolist() == [0, 10, 20, 25, 30, 35, 40]
+
+
+def test_a_state_without_a_signal_does_not_resume_a_file_that_has_it(tmp_path):
+    path = tmp_path / "run.h5"
+    media = {n: tf.Signal(diffusion=10.0, initial=1.0) for n in ("a", "b")}
+    about = {"box": ((-8, -8), (8, 8)), "spacing": 4.0}
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Medium(**about, **media), dim=2, dt=0.1)
+    list(tf.simulate(scene, until=0.2, record=path))
+    with tf.Results(path) as results:
+        last, before = results.state(scene), path.read_bytes()
+    other = tf.Scene(tf.Growth(rate=1.0), tf.Medium(**about, a=media["a"]), dim=2, dt=0.1)
+    without = lambda x: {n: v for n, v in x.items() if n != "out.b"}
+    state = last.replace(fields=without(last.fields), declared=without(last.declared))
+    recorder = tf.Recorder(path, other, append=True, changed=True)
+    with pytest.raises(tf.InputError, match="lacks the field 'b'"):
+        list(tf.simulate(other, state, until=0.4, record=recorder))
+    assert path.read_bytes() == before

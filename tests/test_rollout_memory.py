@@ -9,7 +9,7 @@ import torch
 
 import torchfilm as tf
 from torchfilm.physics.adjoint import _AdjointSolve
-from torchfilm.tools.segments import Segment, keep, kept, no_segment
+from torchfilm.tools.segments import Segment, _sum_of_bits, keep, kept, no_segment
 from torchfilm.tools.tangents import outside_checkpoints
 
 F64 = torch.float64
@@ -199,6 +199,42 @@ def test_what_a_rule_reads_must_not_change_before_the_gradient(what):
         tensor.fill_(0.0)
     with pytest.raises(tf.InputError, match=r"does its steps again, and the step to 0.5 h ended"):
         end.a.sum().backward()
+
+
+@pytest.mark.parametrize(("until", "segment"), [(0.2, 1), (0.1, 10), (0.3, 3)])
+@pytest.mark.parametrize("founders", [1, 64])
+def test_the_last_step_of_a_segment_is_compared_too(until, segment, founders):
+    """Also where all cells have the same numbers, and little else changes."""
+    light, weight = [1.0], torch.tensor(2.0, dtype=F64, requires_grad=True)
+
+    def shine(cells):
+        cells.light = (cells.time > until - 0.15) * weight * light[0] * torch.ones_like(cells.light)
+
+    places = [[3.0 * k, 0.0] for k in range(founders)]
+    scene = tf.Scene(
+        tf.Rules(shine, variables={"light": 0.0}), tf.Growth(rate=0.0), dt=0.1,
+        founders=tf.Cells(places, [[0.0, 1.0]] * founders, 2.0),
+    )  # fmt: skip
+    end = tf.rollout(scene.bind(dtype=F64), until=until, segment=segment)
+    assert (end.light == 2.0).all()
+    light[0] = 0.0
+    with pytest.raises(tf.InputError, match=f"the step to {until:g} h ended otherwise"):
+        end.light.sum().backward()
+
+
+def test_rollouts_of_no_cells_end():
+    model = tf.Scene(tf.Growth(rate=1.0), dim=2, dt=0.1).bind()
+    state = model.start()
+    empty = state.remove(torch.ones(1, dtype=torch.bool), "removed")
+    assert tf.rollout(model, empty, until=0.3).cells == 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.int64, torch.bool])
+def test_sums_of_bits_tell_numbers_their_order_and_their_count(dtype):
+    given = [torch.full((n,), x) for n in (0, 1, 3, 64, 128, 4096) for x in (0, 1)]
+    given += [torch.tensor(x) for x in ([0, 1], [1, 0], [1, 1, 0], [0, 1, 1], [1, 0, 1])]
+    sums = [int(_sum_of_bits(x.to(dtype))) for x in given]
+    assert len(set(sums)) == len(sums) - 1  # the two of no numbers are alike
 
 
 def test_steps_that_repeat_give_their_gradient_twice():

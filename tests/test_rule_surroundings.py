@@ -264,8 +264,25 @@ def test_pairs_that_draw_are_places_of_cells(state):
     i, j = cells.contacts(0.1)
     with pytest.raises(tf.InputError, match=r"contact_random\(j\)"):
         cells.contact_random(i, j.double())
-    with pytest.raises(InputError, match=f"{len(i)} and 3 places: it takes pairs"):
-        cells.contact_random(i, j[:3])
+    for one, other in ((i, j[:3]), (i[0], j[0])):
+        with pytest.raises(InputError, match=r"it takes pairs, \(P,\) each"):
+            cells.contact_random(one, other)
+    for place in (-1, state.cells):
+        with pytest.raises(tf.InputError, match=r"contact_random\(i, j\)"):
+            cells.contact_random(i, torch.full_like(j, place))
+
+
+def test_draws_of_contacts_have_46_bits_of_their_own(state):
+    """The fine part is no copy of the coarse one, nor what `random` gives."""
+    cells = seen(state)
+    i, j = cells.contacts(0.1)
+    found = cells.contact_random(i, j)
+    coarse = (found * 2**23).floor() / 2**23
+    fine = (found - coarse) * 2**23
+    assert len(fine.unique()) == len(fine)
+    assert abs(float(torch.corrcoef(torch.stack([coarse, fine]))[0, 1])) < 4 / len(i) ** 0.5
+    other = seen(state).random().double()
+    assert not torch.isin((coarse * 2**23).long(), (other * 2**23).long()).any()
 
 
 def test_contacts_are_looked_for_once_and_a_rule_may_change_its_own(state, monkeypatch):

@@ -105,6 +105,9 @@ def _variables(
     """The variables of each cell by name, of the shape of their `kinds`, checked."""
     if not isinstance(given, Mapping):
         raise checks.input_error("extra", given, 'numbers by name, such as {"plasmids": 4}')
+    for name in given:
+        if not isinstance(name, str):
+            raise checks.input_error("extra", name, 'names, such as "plasmids"')
     return {name: _of_each(f"extra[{name!r}]", x, kinds, shares) for name, x in given.items()}
 
 
@@ -177,13 +180,12 @@ def _shares(types: object, count: int) -> dict[int, float] | None:
     for kind in types:
         checks.integer("types", kind, least=0)
     whole = all(isinstance(n, int | np.integer) and type(n) is not bool for n in types.values())
-    if whole and (sum(types.values()) == count or set(types.values()) - {0, 1}):
+    all_cells = sum(map(int, types.values())) if whole else -1
+    if whole and (all_cells == count or set(types.values()) - {0, 1}):
         numbers = {k: checks.integer(f"types[{k}]", n, least=0) for k, n in types.items()}
-        if sum(numbers.values()) != count:
+        if all_cells != count:
             rule = f"numbers that sum to the count, {count}, or shares that sum to 1"
-            raise checks.input_error(
-                "types", numbers, rule, f"Their sum is {sum(numbers.values())}."
-            )
+            raise checks.input_error("types", numbers, rule, f"Their sum is {all_cells}.")
         types = {kind: n / count for kind, n in numbers.items()}
     for kind, share in types.items():
         checks.number(f"types[{kind}]", share, least=0.0, most=1.0)

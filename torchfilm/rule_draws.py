@@ -14,7 +14,7 @@ from torchfilm.circuits.partition import binomial
 from torchfilm.rule_values import RuleError, as_tensor
 from torchfilm.state import State
 from torchfilm.tools.random import MASK, fine_uniform, uniform
-from torchfilm.tools.row_checks import check_rows
+from torchfilm.tools.row_checks import check_rows, out_of_range
 
 
 class Draws:
@@ -105,13 +105,19 @@ class StepDraws(Draws):
         state = self._state
         for name, rows in ("contact_random(i)", i), ("contact_random(j)", j):
             check_rows(name, rows, state.cells)
-        if i.shape != j.shape:
+        if i.dim() != 1 or i.shape != j.shape:
             raise RuleError(
-                f"contact_random was given {len(i)} and {len(j)} places: it takes pairs, (P,) each"
+                f"contact_random was given places of the shapes {tuple(i.shape)} and"
+                f" {tuple(j.shape)}: it takes pairs, (P,) each"
             )
         _, purpose = self._next()
-        uid = (state.uid[i] & MASK) | ((state.uid[j] & MASK) << 32)
-        key = state.seed, state.stream[state.colony[i]], uid, state.step
+        try:
+            one, other = (state.uid.index_select(0, rows) & MASK for rows in (i, j))
+        except (IndexError, RuntimeError) as error:
+            raise out_of_range("contact_random(i, j)", torch.stack([i, j]), state.cells) from error
+        uid = one | (other << 32)
+        stream = state.stream.index_select(0, state.colony.index_select(0, i))
+        key = state.seed, stream, uid, state.step
         coarse, fine = (uniform(*key, f"{purpose} pair {k}", torch.float64) for k in (0, 1))
         return fine_uniform(coarse, fine)
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
+from torch.utils.checkpoint import checkpoint, set_checkpoint_early_stop
 
 from torchfilm.loop import (
     EndlessRunWarning,
@@ -213,7 +213,8 @@ def rollout(
     kept, and the steps between are computed again on the way back (torch.utils.checkpoint), so that
     memory grows with the number of segments and not of steps; None keeps all, and saves the time.
     So nothing that the scene reads may change before the gradient is taken: call `backward` before
-    the step of an optimiser. Steps that do not repeat then are an error.
+    the step of an optimiser. On the CPU, and where torch is deterministic, steps that do not repeat
+    then are an error.
     scene: or a model, or a `Replay`, whose steps are as long as its recording's. state: from which
     to start; by default the first. Failures are raised as in `simulate`.
     """
@@ -258,7 +259,8 @@ def rollout(
 
     while state.step < last:
         count = min(segment, last - state.step)
-        state = checkpoint(segment_of, Segment(), state, count, use_reentrant=False)
+        with set_checkpoint_early_stop(False):  # so that the last step is compared, too
+            state = checkpoint(segment_of, Segment(), state, count, use_reentrant=False)
     return state
 
 

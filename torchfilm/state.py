@@ -324,7 +324,8 @@ class State:
 
     def remove(self, gone: Tensor, fate: str) -> State:
         """The state without the cells where `gone` (N,) is true, whose end is noted. fate: one of
-        `FATES`."""
+        `FATES`; of cells that go between two steps of a run, a recording knows that they went, and
+        calls them removed."""
         row_checks.check_mask("gone", gone, self.cells)
         checks.choice("fate", fate, FATES)
         if not bool(gone.any()):

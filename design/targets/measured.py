@@ -130,22 +130,26 @@ class Measured(Target):
             Measured.of_colonies({"donors": count_of(0)}, {"donors": [31, 25, 40, 28]}, time=3.0)
 
         values: by name, as many numbers as colonies, three at least. Wanted is their mean, and the
-        spread is their standard deviation, or 1 % of the greatest number, so that a colony like
-        them has a loss of about 1. error: of measurement, of the mean; by default 0, as of counts.
+        spread is their standard deviation, at least 1 % of the greatest number, so that a colony
+        like them has a loss of about 1. error: of measurement, of the mean; by default 0, as of counts.
         The rest is as of `Measured`. Raises InputError for other names and numbers.
         """
-        found = {}
+        found, counts = {}, {}
+        if not isinstance(functions, Mapping) or not functions:
+            rule = "a dict of functions by name, such as {'donors': donors}"
+            raise checks.input_error("Measured.of_colonies: functions", functions, rule)
         for name, numbers in checked_columns("Measured.of_colonies: values", values, functions):
             label = f"Measured.of_colonies: values[{name!r}]"
-            found[name] = mean_and_spread(label, np.asarray(checks.vector(label, numbers))[None])
-        counts = {name: len(values[name]) for name in found}
+            row = np.asarray(checks.vector(label, numbers))
+            found[name], counts[name] = mean_and_spread(label, row[None]), len(row)
         if len(set(counts.values())) > 1:
             rule = "as many numbers of each, one for each colony"
             raise checks.input_error("Measured.of_colonies: values", counts, rule)
         wanted, spread = ({name: float(x[k][0]) for name, x in found.items()} for k in (0, 1))
         return Measured(
             functions, wanted, spread, extinct=extinct, smooth=smooth, time=time,
-            colonies=next(iter(counts.values())), error=error or dict.fromkeys(functions, 0.0),
+            colonies=next(iter(counts.values())),
+            error=dict.fromkeys(functions, 0.0) if error is None else error,
         )  # fmt: skip
 
     def check(self, state: tf.State) -> None:
@@ -267,8 +271,9 @@ def mean_and_spread(label: str, rows: np.ndarray) -> tuple[np.ndarray, np.ndarra
             f"numbers of {ENOUGH} colonies at least, since fewer do not tell how much they differ"
         )
         raise checks.input_error(label, rows.tolist(), rule, "Give Measured their mean and spread.")
-    least = FINEST * np.nanmax(np.abs(rows))
-    if not least > 0:
+    greatest = np.abs(rows).max(1)
+    least = FINEST * np.where(greatest == 0, np.nanmax(greatest), greatest)
+    if not np.nanmax(least) > 0:
         hint = "Give Measured the spread, or leave it out."
         raise checks.input_error(label, rows.tolist(), "numbers of which one is not 0", hint)
     return rows.mean(1), np.maximum(rows.std(1, ddof=1), least)

@@ -119,15 +119,22 @@ def data_of(target: Target) -> list[Observed]:
     return found
 
 
+def _of_one_time(observed: Observed) -> list[Observed]:
+    """The data of each condition and time, in the order of their values."""
+    if isinstance(observed, ObservedConditions):
+        return [x for part in observed.conditions.parts for x in _of_one_time(cast(Observed, part))]
+    return list(observed.frames) if isinstance(observed, ObservedCourse) else [observed]
+
+
 def errors(observed: Observed) -> list[float]:
     """The standard error of measurement of each statistic, (K,), that simulations do not have."""
-    if isinstance(observed, ObservedConditions):
-        return [e for part in observed.conditions.parts for e in errors(cast(Observed, part))]
-    if isinstance(observed, ObservedCourse):
-        return [e for frame in observed.frames for e in errors(frame)]
-    if isinstance(observed, ObservedMeasures):
-        return list(observed.plan.errors)
-    return [0.0] * len(observed.values)
+    return [
+        error
+        for part in _of_one_time(observed)
+        for error in (
+            part.plan.errors if isinstance(part, ObservedMeasures) else [0.0] * len(part.values)
+        )
+    ]
 
 
 def grown(observed: Observed) -> Target:
@@ -140,10 +147,15 @@ def standard_errors(observed: Observed, replicates: int | None = None) -> np.nda
     over some; that of measured numbers is their error, unless they have one beside it. replicates:
     of a simulation, for the root of half the squares of its error and that of the value."""
     spread, seen = np.array(observed.spread), np.array(_colonies(observed))
-    measured = np.array(errors(observed))  # which simulations have, too
     grown = seen if replicates is None else np.array(averaged(observed, replicates))
-    differ = np.where(measured == spread, 0.0, spread * np.sqrt(0.5 / seen + 0.5 / grown))
-    return np.hypot(measured, differ)
+    differ = spread * np.sqrt(0.5 / seen + 0.5 / grown)
+    whole = np.array([
+        isinstance(part, ObservedMeasures) and part.measured.error is None
+        for part in _of_one_time(observed)
+        for _ in part.values
+    ])  # fmt: skip
+    # simulations have the error of measurement, too
+    return np.hypot(np.array(errors(observed)), np.where(whole, 0.0, differ))
 
 
 def averaged(observed: Observed, replicates: int) -> list[int]:
@@ -154,11 +166,7 @@ def averaged(observed: Observed, replicates: int) -> list[int]:
 
 def _colonies(observed: Observed) -> list[int]:
     """Of how many colonies each statistic is, (K,)."""
-    if isinstance(observed, ObservedConditions):
-        return [n for part in observed.conditions.parts for n in _colonies(cast(Observed, part))]
-    if isinstance(observed, ObservedCourse):
-        return [n for frame in observed.frames for n in _colonies(frame)]
-    return [observed.colonies] * len(observed.values)
+    return [part.colonies for part in _of_one_time(observed) for _ in part.values]
 
 
 def cells_each(observed: Observed) -> float:

@@ -136,7 +136,10 @@ def _of_colonies(
         rule = (
             f"numbers by time and colony, {len(moments)} rows; NaN of all where a time is missing"
         )
-        rows = np.asarray(given, dtype=float) if _is_table(given) else np.empty((0, 0))
+        try:
+            rows = np.asarray(given, dtype=float) if _is_table(given) else np.empty((0, 0))
+        except (TypeError, ValueError):
+            rows = np.empty((0, 0))
         missing = np.isnan(rows)
         if len(rows) != len(moments) or (missing.any(1) != missing.all(1)).any():
             raise checks.input_error(label, given, rule)

@@ -68,8 +68,14 @@ def test_a_course_takes_numbers_by_time_and_colony():
         assert (frame.time, frame.values, frame.colonies) == (time, alone.values, 3)
         assert errors(frame) == [0.0]
     assert first.spread == (1.0,)
-    assert last.spread == (pytest.approx(0.03),)  # of the greatest number at any time
+    assert last.spread == (pytest.approx(0.02),)
     assert course(error={"level": 0.2}).frames[0].plan.errors == (0.2,)
+
+
+def test_the_least_spread_is_that_of_its_time():
+    """A colony that grows a hundredfold: early times are as sharp as they are."""
+    grows = course([[2.0, 2.0, 3.0], [0.0, 0.0, 0.0], [900.0, 1000.0, 1100.0]])
+    assert [f.spread[0] for f in grows.frames] == pytest.approx([3**-0.5, 11.0, 100.0])
 
 
 def test_simulations_have_no_errors_that_exact_numbers_do_not_have():
@@ -93,6 +99,7 @@ def test_standard_errors_are_of_colonies_and_of_measurement():
     assert of() == [2.0]  # the spread is the error of measurement
     assert of(error={"level": 0.0}) == [1.0]  # 2/√4
     assert of(error={"level": 0.75}) == [1.25]
+    assert of(error={"level": 2.0}) == [pytest.approx(5**0.5)]
     both = Measured.of_colonies(
         {"b": twice, "a": level}, {"a": SEEN, "b": SEEN}, error={"a": 0.1, "b": 0.2}
     )
@@ -147,6 +154,7 @@ def test_bad_numbers_of_colonies(values, words):
         ),
         ({"values": [[1, 2, 3], [1, 2, 3]]}, "by time and colony, 3 rows"),
         ({"values": [[1, 2], [1, 2], [3, 4]]}, "numbers of 3 colonies at least"),
+        ({"values": [["a", "b", "c"]] * 3}, "by time and colony, 3 rows"),
         ({"error": {"level": -1.0}}, r"error\['level'\] = -1"),
         ({"error": {"other": 1.0}}, "by the names 'level'"),
     ],
@@ -164,6 +172,11 @@ def test_measures_of_one_time_are_of_as_many_colonies():
         ObservedCourse.of_measures(
             functions, times=(1, 2), values={"a": [[1, 2, 3]] * 2, "b": [[1, 2, 3, 4]] * 2}
         )
+    with pytest.raises(tf.InputError, match=r"functions = \{\}"):
+        Measured.of_colonies({}, {})
+    for error in ({}, 0):
+        with pytest.raises(tf.InputError, match=r"Measured.error = "):
+            Measured.of_colonies({"a": level}, {"a": [1, 2, 3]}, error=error)
     for error in ({"a": 1.0}, 1.0):
         with pytest.raises(tf.InputError, match=r"Measured.error = .*names 'a', 'b'"):
             Measured(functions, {"a": 1, "b": 1}, {"a": 1, "b": 1}, error=error)

@@ -308,7 +308,10 @@ class Recorder(metaclass=checks.KnownKeywords):
                 "state", "with other cells", f"of cells of the last frame of {self.path}",
                 "Record to a file of its own.",
             )  # fmt: skip
-        for scope, columns in ("cells", cell_columns), ("frames/colony", colony_columns):
+        for scope, columns in (
+            ("cells", cell_columns), ("frames/colony", colony_columns),
+            ("signals", voxel_columns), ("frames/grid", grid_columns),
+        ):  # fmt: skip
             recorded, own = set(kept.file.get(scope, ())), set(columns(state))
             if other := sorted(recorded ^ own):
                 has = "lacks" if other[0] in recorded else "has"

@@ -14,6 +14,8 @@ import numpy as np
 KINDS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#661100")
 MOST_TYPES = 24
 GOLDEN = 0.618034  # of a turn, from one hue to the next
+# Saturation and value, in turn: with the hues they tell sixty numbers apart, by a ΔE of 8 and more.
+SHADES = ((0.9, 0.95), (0.6, 0.9), (0.35, 0.85), (0.9, 0.75), (0.6, 0.6))
 APART = 0.45  # the least distance between two categories, as red, green and blue
 
 
@@ -34,9 +36,16 @@ def colours_of_kinds(kinds: Sequence[int], keep: bool = False) -> list[Any]:
 
 
 def colours_by_number(numbers: np.ndarray) -> np.ndarray:
-    """Red, green and blue (N, 3) of any integers (N,), by each of them alone."""
+    """Red, green and blue (N, 3) of any integers (N,), by each of them alone. The hues of numbers
+    that follow each other are far apart; of more than sixty, some look alike."""
+    from matplotlib.colors import hsv_to_rgb, to_rgb
+
     kinds, of = np.unique(numbers, return_inverse=True)
-    return np.array(colours_of_kinds(kinds.tolist(), keep=True)).reshape(-1, 3)[of]
+    hue, shade = kinds * GOLDEN % 1.0, np.array(SHADES)[kinds % len(SHADES)]
+    found = hsv_to_rgb(np.column_stack([hue, shade]))
+    first = (kinds >= 0) & (kinds < len(KINDS))
+    found[first] = np.array([to_rgb(KINDS[k]) for k in kinds[first]]).reshape(-1, 3)
+    return found[of.reshape(-1)]
 
 
 def colour_of_kind(kind: int, turns: int) -> tuple[float, ...]:

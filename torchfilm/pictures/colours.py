@@ -40,7 +40,7 @@ Limits = Mapping[str, tuple[float, float]]
 # What tables have of each cell, and no frame holds.
 NOT_DRAWN = dict.fromkeys(
     ("age", "born", "volume"), "Tables and ParaView have it (to_pandas, export); pictures do not."
-) | {FOUNDER: "A state does not know the lines of descent: draw a results file."}
+) | {FOUNDER: "It is a colour of a results file: a state does not know the lines of descent."}
 
 
 @dataclass(frozen=True)

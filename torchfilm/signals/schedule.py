@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -69,7 +70,7 @@ class Schedule(metaclass=checks.KnownKeywords):
 
     def place(self, time: float) -> int:
         """Which of the values holds at a time, h."""
-        after = time + ROUNDING * max(1.0, abs(time))
+        after = time + ROUNDING * max(1.0, abs(time)) if math.isfinite(time) else time
         now = max(after, 0.0) if self.period is None else after % self.period
         return bisect_right(self.times, now) - 1
 

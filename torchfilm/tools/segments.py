@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 from torch.autograd import Variable
 
+MIX = 0x1E3779B97F4A7C15, 0x3F58476D1CE4E5B9  # odd, of well mixed bits
 _NOW: ContextVar[tuple[Segment, bool] | None] = ContextVar("segment", default=None)
 
 
@@ -76,8 +77,10 @@ def _sum_of_bits(tensor: Tensor) -> Tensor:
     flat = tensor.detach().reshape(-1)
     size = flat.element_size()
     whole = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}[size]
-    odd = torch.arange(1, 2 * len(flat), 2, device=flat.device)
-    return (flat.view(whole) * odd).sum()
+    # mixed with its place before the sum: equal numbers would cancel, those of floats above all
+    x = flat.view(whole).long() ^ (torch.arange(1, len(flat) + 1, device=flat.device) * MIX[0])
+    x = (x ^ (x >> 29)) * MIX[1]
+    return (x ^ (x >> 32)).sum()
 
 
 @contextmanager
