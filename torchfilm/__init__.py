@@ -23,6 +23,7 @@ from torchfilm.effects.rules import Rules
 from torchfilm.effects.scaled import Scaled
 from torchfilm.effects.signal import Signal
 from torchfilm.effects.sloughing import Sloughing
+from torchfilm.image_field import ImageField
 from torchfilm.initial_cells import Cells
 from torchfilm.inocula import inoculum
 from torchfilm.loop import advance, failures
@@ -103,6 +104,7 @@ __all__ = [
     "Groups",
     "Growth",
     "GrowthRecording",
+    "ImageField",
     "InputError",
     "Lineage",
     "LivePlot",

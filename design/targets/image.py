@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from torch import Tensor
 
 import torchfilm as tf
@@ -110,23 +109,13 @@ class Image(ProfileTarget):
         """(rows, columns), the first row at the bottom."""
         return np.array(self.mask)[::-1].copy()
 
+    @cached_property
+    def _field(self) -> tf.ImageField:
+        """Relative to its centre."""
+        return tf.ImageField(np.array(self.mask), self.size)
+
     def target_profile(self, state: tf.State) -> Tensor:
-        at = offset(state, self.centre)
-        pixels = torch.as_tensor(self.pixels, device=state.device)
-        inside = torch.ones_like(state.colony, dtype=torch.bool)
-        before, after, share = [], [], []
-        for k, count in enumerate(pixels.shape[::-1]):
-            inside &= at[:, k].abs() <= 0.5 * self.size[k]
-            # in pixels, from the middle of the first; the outermost level continues to the rim
-            x = ((at[:, k] / self.size[k] + 0.5) * count - 0.5).clamp(0.0, count - 1.0)
-            low = x.floor().long().clamp(max=max(count - 2, 0))
-            before.append(low)
-            after.append((low + 1).clamp(max=count - 1))
-            share.append(x - low)
-        (i0, j0), (i1, j1), (u, v) = before, after, share
-        below = (1 - u) * pixels[j0, i0] + u * pixels[j0, i1]
-        above = (1 - u) * pixels[j1, i0] + u * pixels[j1, i1]
-        return torch.where(inside, (1 - v) * below + v * above, 0.0).unsqueeze(1)
+        return self._field(offset(state, self.centre)).unsqueeze(1)
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         # a frame of dark pixels closes the outline where the rim is lit
