@@ -165,8 +165,8 @@ def test_strips_and_films_pass_on_what_is_asked(command, shining, monkeypatch):
     command("show", "a.h5", "--times", 0.1, 0.5, "--out", "b.png", *look)
     command("show", "a.h5", "--movie", "b.gif", "--fps", 4, *look)
     assert strips == [
-        {"out": Path("a_strip.png"), "frames": 3, "times": None, **wanted},
-        {"out": Path("b.png"), "frames": None, "times": [0.1, 0.5], **wanted},
+        {"out": Path("a_strip.png"), "count": 3, "times": None, **wanted},
+        {"out": Path("b.png"), "count": None, "times": [0.1, 0.5], **wanted},
     ]
     assert films == [{"out": Path("b.gif"), "fps": 4.0, **wanted}]
 
@@ -196,7 +196,7 @@ def test_pictures_strips_and_films_are_drawn(command, shining, capsys):
         ("--section middle --background ahl", r"section = 'middle'"),
         ("--strip 2 --movie b.gif", r"--strip or --times, --movie: give one of them"),
         ("--strip 2 --frame 0", r"--frame, --strip or --times: give one of them"),
-        ("--strip 2 --times 0.1", r"times and frames"),
+        ("--strip 2 --times 0.1", r"--strip, --times: give one of them"),
         ("--movie b.gif --out b.png", r"--movie, --out: give one of them"),
         ("--movie b.avi", r"\.mp4 or \.gif"),
         ("--times 9", r"times = 9\.0.*0 to 0\.6 h"),

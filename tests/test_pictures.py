@@ -351,7 +351,7 @@ def test_runs_without_cells_are_explained_and_drawn(tmp_path):
     path = tmp_path / "run.h5"
     for _ in tf.simulate(scene, until=0.1, record=tf.Recorder(path, scene, every=2)):
         pass
-    strip = tf.pictures.strip(path, background="u", frames=2)
+    strip = tf.pictures.strip(path, background="u", count=2)
     assert [ax.get_title() for ax in strip.figure.axes[:2]] == ["0 h, 0 cells", "0.1 h, 0 cells"]
     tf.pictures.movie(path, tmp_path / "run.gif", background="u")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.gif", "run.h5"]

@@ -115,7 +115,7 @@ def test_frames_of_a_strip():
         with pytest.raises(tf.InputError, match=r"times = .*0 to 2.1 h"):
             choose_frames(times, bad, None)
     for wrong in (0, True, 2.5):
-        with pytest.raises(tf.InputError, match="frames"):
+        with pytest.raises(tf.InputError, match="count"):
             choose_frames(times, None, wrong)
     with pytest.raises(tf.InputError, match="one of them"):
         choose_frames(times, [1.0], 3)
@@ -200,7 +200,7 @@ def test_wide_panels_stand_one_below_the_other(run, tmp_path, laid_out):
 
 def test_one_colony_is_one_row_and_the_title_names_it(run, tmp_path, laid_out):
     tf.pictures.strip(
-        run, frames=4, colonies=[1], background="ahl", whole=True, out=tmp_path / "a.png"
+        run, count=4, colonies=[1], background="ahl", whole=True, out=tmp_path / "a.png"
     )
     assert laid_out["shape"] == (1, 4) and laid_out["title"].endswith("colony 1")
 
@@ -222,7 +222,7 @@ def test_a_colony_that_has_no_cells_yet_or_any_more_is_drawn_empty(tmp_path):
         pass
     with tf.Results(path) as results:
         assert results.counts[-1].tolist() == [1, 0]
-    assert tf.pictures.strip(path, frames=3, background="ahl", out=tmp_path / "a.png").path.exists()
+    assert tf.pictures.strip(path, count=3, background="ahl", out=tmp_path / "a.png").path.exists()
     assert tf.pictures.movie(path, tmp_path / "a.gif", background="ahl", dpi=40).exists()
     with pytest.raises(tf.InputError, match=r"colonies = \[1\]"):
         tf.show(path, colonies=[1], out=tmp_path / "b.png")

@@ -79,6 +79,8 @@ class Show:
 
     def _check_one(self, many: bool) -> None:
         """Raise InputError for options that exclude one another."""
+        if self.strip is not None and self.times:
+            raise InputError("--strip, --times: give one of them.")
         chosen = {
             "--frame": self.frame != -1,
             "--strip or --times": many,
@@ -104,7 +106,7 @@ class Show:
             pictures.movie(self.file, out, fps=self.fps, **options)
         elif many:
             pictures.strip(
-                self.file, frames=self.strip, times=self.times or None, out=out, **options
+                self.file, count=self.strip, times=self.times or None, out=out, **options
             )
         else:
             pictures.show(self.file, frame=self.frame, out=out, **options)

@@ -182,7 +182,7 @@ def strip(
     what: str | Path | Results,
     *,
     times: Sequence[float] | None = None,
-    frames: int | None = None,
+    count: int | None = None,
     colour: str | None = None,
     channels: Mapping[str, str] | None = None,
     background: str | None = None,
@@ -196,7 +196,7 @@ def strip(
 ) -> Picture:
     """Draw one or more colonies at several times, with one scale and one range of colours.
 
-    times: h; the recorded frame nearest to each time is drawn, with its own time as title. frames:
+    times: h; the recorded frame nearest to each time is drawn, with its own time as title. count:
     instead, at most this many frames, evenly spaced from first to last; default 4. A colony is a
     row. Panels that are more than twice as wide as high are placed one below the other, and a
     colony is a column. colonies: their ids; default the first 4. what: a results file, or its path.
@@ -206,7 +206,7 @@ def strip(
     style = PlotStyle(colour, channels, background, limits, view, section, whole)
     with opened(what) as results:
         check_not_results(results.path, out)
-        chosen = choose_frames(results.times, times, frames)
+        chosen = choose_frames(results.times, times, count)
         recorded = RecordedFrames(results, chosen, background, colour)
         places, more = choose_colonies(
             recorded.shown(style.shows_box), results.colony_id, colonies, 4
@@ -327,15 +327,15 @@ def checked_ids(colonies: object) -> list[int] | None:
 
 
 def choose_frames(
-    recorded: np.ndarray, times: Sequence[float] | None, frames: int | None
+    recorded: np.ndarray, times: Sequence[float] | None, count: int | None
 ) -> list[int]:
     """The indices of a strip's frames."""
     if times is None:
-        count = checks.integer("frames", 4 if frames is None else frames, least=1)
+        count = checks.integer("count", 4 if count is None else count, least=1)
         wanted = np.linspace(recorded[0], recorded[-1], count) if count > 1 else recorded[-1:]
         return sorted({int(np.abs(recorded - t).argmin()) for t in wanted})
-    if frames is not None:
-        raise checks.InputError("times and frames both set the frames to draw: give one of them.")
+    if count is not None:
+        raise checks.InputError("times and count both set the frames to draw: give one of them.")
     # half of the longest interval between two frames: a time further away was not recorded
     slack = 0.5 * float(np.diff(recorded).max(initial=0.0)) + 1e-9
     places = []
