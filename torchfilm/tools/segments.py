@@ -39,12 +39,14 @@ class Segment:
     @contextmanager
     def steps(self) -> Iterator[bool]:
         """Around the steps, each time; whether it is for a backward pass."""
-        again, self._done, self._step = self._done, True, 0
+        again, self._done = self._done, True
+        outer, self._step = self._step, 0  # rates that take a gradient begin the steps once more
         before, first = _NOW.set((self, again)), next(self._numbers)
         try:
             yield again
         finally:
             _NOW.reset(before)
+            self._step = outer
             if again:  # which may not reach all Functions
                 made = range(first, next(self._numbers))
                 with suppress(RuntimeError):  # outside of a backward pass: who looks at a tensor
