@@ -53,14 +53,7 @@ class Draws:
         cell, (N,), or each division, (M,). New mutations, say, at a rate of 0.003 per hour:
         cells.mutations = cells.mutations + cells.poisson(0.003 * cells.dt)."""
         fine = self._fine()
-        expected = _column("poisson", mean, fine)
-        wrong = ~((expected >= 0) & expected.isfinite())
-        if bool(wrong.any()):
-            raise RuleError(
-                f"poisson was given the mean {expected[wrong][0]:g}: it must be finite, and 0 or"
-                " more"
-            )
-        return poisson(expected, fine).to(self._state.dtype)
+        return poisson(_at_least_zero("poisson", "mean", mean, fine), fine).to(self._state.dtype)
 
     def _fine(self) -> Tensor:
         return fine_uniform(self.random(), self.random())
@@ -90,12 +83,7 @@ class StepDraws(Draws):
         """Whether what happens at this rate, 1/h, does so in this step, to each cell, (N,) bool: of
         the probability 1 − exp(−rate · dt)."""
         fine = self._fine()
-        each = _column("event", rate, fine)
-        wrong = ~((each >= 0) & each.isfinite())
-        if bool(wrong.any()):
-            raise RuleError(
-                f"event was given the rate {each[wrong][0]:g}: it must be finite, and 0 or more"
-            )
+        each = _at_least_zero("event", "rate", rate, fine)
         return fine < -torch.expm1(-each * self._dt)
 
     def contact_random(self, i: Tensor, j: Tensor) -> Tensor:
@@ -139,6 +127,16 @@ def _column(what: str, value: Any, like: Tensor) -> Tensor:
             f" {tuple(like.shape)}."
         )
     return given.expand(like.shape)
+
+
+def _at_least_zero(what: str, noun: str, value: Any, like: Tensor) -> Tensor:
+    given = _column(what, value, like)
+    wrong = ~((given >= 0) & given.isfinite())
+    if bool(wrong.any()):
+        raise RuleError(
+            f"{what} was given the {noun} {given[wrong][0]:g}: it must be finite, and 0 or more"
+        )
+    return given
 
 
 def _probability(what: str, value: Any, like: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchfilm.io.layout import numpy_of
 from torchfilm.state import FATES, State
+from torchfilm.state_colonies import Ended
 from torchfilm.tools import checks
 
 Rows = tuple[np.ndarray, ...]  # the columns of `layout.LINEAGE`, in their order
@@ -27,14 +28,22 @@ def births_of(state: State) -> list[Rows]:
     return found
 
 
-def ends_of(state: State) -> list[Rows]:
-    """The ends of a step."""
-    return [_rows(state, e.fate, e.colony_id, e.uid, e.length, e.cell_type) for e in state.ended]
+def ends_of(state: State, ended: Iterable[Ended]) -> list[Rows]:
+    """Ends, which came in the step to a state."""
+    found = []
+    for e in ended:
+        steps, fates, times = (
+            np.full(e.uid.numel(), x) for x in (state.step, FATES.index(e.fate), state.time)
+        )
+        types = np.full_like(steps, -1) if e.cell_type is None else numpy_of(e.cell_type)
+        own = (numpy_of(x) for x in (e.colony_id, e.uid))
+        found.append((*own, steps, fates, numpy_of(e.length), times, types))
+    return found
 
 
-def removed_before(state: State, before: State) -> list[Rows]:
-    """The ends of cells that were taken out since the state before the step, by hand: they are not
-    there, and did not end in the step."""
+def removed_before(state: State, before: State) -> list[Ended]:
+    """Cells that were taken out since the state before the step, by hand: they are not there, and
+    did not end in the step."""
     ended = sum(e.uid.numel() for e in state.ended)
     born = sum(b.uid.numel() for b in state.births)
     if state.cells == before.cells + born - ended:
@@ -42,33 +51,26 @@ def removed_before(state: State, before: State) -> list[Rows]:
     there = _keys([(state.own_colony_id, state.uid), *((e.colony_id, e.uid) for e in state.ended)])
     own = zip(before.own_colony_id.tolist(), before.uid.tolist(), strict=True)
     gone = torch.tensor([key not in there for key in own], device=before.device)
-    e = before.noted_end(torch.nonzero(gone).squeeze(1), "removed")
-    return [_rows(state, e.fate, e.colony_id, e.uid, e.length, e.cell_type)]
+    return [before.noted_end(torch.nonzero(gone).squeeze(1), "removed")]
 
 
-def absent_from(state: State, frame: Mapping[str, np.ndarray], ids: np.ndarray) -> Rows:
-    """The cells of a recorded frame that a state of its step lacks: ids of colonies, uids, lengths
-    and types. ids: of the colonies of the frame."""
+def absent_from(state: State, frame: Mapping[str, np.ndarray], ids: np.ndarray) -> list[Ended]:
+    """The cells of a recorded frame that a state of its step lacks. ids: of the colonies of the
+    frame."""
     there = _keys([(state.own_colony_id, state.uid)])
-    colony, uid = ids[frame["colony"]], frame["uid"]
-    gone = np.array([key not in there for key in zip(colony.tolist(), uid.tolist(), strict=True)])
-    kind = frame.get("cell_type", np.full_like(uid, -1))
-    return tuple(x[gone.astype(bool)] for x in (colony, uid, frame["length"], kind))
-
-
-def removed(state: State, absent: Rows) -> list[Rows]:
-    """The ends of such cells, in the first step after."""
-    ids, uid, length, kind = (torch.from_numpy(x) for x in absent)
-    return [_rows(state, "removed", ids, uid, length, kind)] if len(uid) else []
-
-
-def _rows(
-    state: State, fate: str, ids: Tensor, uid: Tensor, length: Tensor, cell_type: Tensor | None
-) -> Rows:
-    count = uid.numel()
-    steps, fates, times = (np.full(count, x) for x in (state.step, FATES.index(fate), state.time))
-    types = np.full(count, -1) if cell_type is None else numpy_of(cell_type)
-    return numpy_of(ids), numpy_of(uid), steps, fates, numpy_of(length), times, types
+    own = zip(ids[frame["colony"]].tolist(), frame["uid"].tolist(), strict=True)
+    gone = np.array([key not in there for key in own], dtype=bool)
+    if not gone.any():
+        return []
+    colony, uid, length = (
+        torch.from_numpy(x[gone]) for x in (ids[frame["colony"]], frame["uid"], frame["length"])
+    )
+    kind = frame.get("cell_type")
+    return [
+        Ended(
+            "removed", colony, uid, length, None if kind is None else torch.from_numpy(kind[gone])
+        )
+    ]
 
 
 def _keys(parts: Iterable[tuple[Tensor, Tensor]]) -> set[tuple[int, int]]:

@@ -13,15 +13,7 @@ import numpy as np
 import torch
 
 from torchfilm.io import replacing
-from torchfilm.io.events import (
-    Rows,
-    absent_from,
-    births_of,
-    check_course,
-    ends_of,
-    removed,
-    removed_before,
-)
+from torchfilm.io.events import Rows, absent_from, births_of, check_course, ends_of, removed_before
 from torchfilm.io.identity import scene_attributes
 from torchfilm.io.layout import (
     AT_CELLS,
@@ -49,12 +41,12 @@ from torchfilm.io.room import SPARE_BYTES, check_room, free_bytes
 from torchfilm.model import Model
 from torchfilm.scene import Scene
 from torchfilm.state import State
+from torchfilm.state_colonies import Ended
 from torchfilm.tools import checks
 from torchfilm.tools.checks import SimulationError
 from torchfilm.tools.whole_files import why_not_written
 from torchfilm.version import __version__
 
-NOBODY: Rows = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64))
 # Suffixes of formats that a run might be thought to write: such a name would mislead.
 OF_OTHERS = (".csv", ".tsv", ".json", ".txt", ".xml")
 
@@ -95,7 +87,9 @@ class Recorder(metaclass=checks.KnownKeywords):
         # events since the last frame that is written
         self.births: list[Rows] = []
         self.ends: list[Rows] = []
-        self.absent = NOBODY  # cells of the last frame that the state which resumes it lacks
+        self.absent: list[
+            Ended
+        ] = []  # of the last frame, where the state that resumes it lacks them
         self.last: State | None = None
         self.written = -1
 
@@ -151,8 +145,8 @@ class Recorder(metaclass=checks.KnownKeywords):
             return
         by_hand = [] if before is None else removed_before(state, before)
         self.births += births_of(state)
-        self.ends += [*removed(state, self.absent), *by_hand, *ends_of(state)]
-        self.absent = NOBODY
+        self.ends += ends_of(state, [*self.absent, *by_hand, *state.ended])
+        self.absent = []
         if (state.step - self.first_step) % self.every == 0:
             self._write(state)
 
@@ -176,7 +170,7 @@ class Recorder(metaclass=checks.KnownKeywords):
     def _open(self, state: State) -> None:
         """Make the new file, complete with a frame, under another name; then put it in place."""
         self._check_still_free()
-        self.births, self.ends, self.absent = [], [], NOBODY
+        self.births, self.ends, self.absent = [], [], []
         try:
             with ExitStack() as hold:
                 if self.append:
