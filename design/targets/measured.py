@@ -134,21 +134,19 @@ class Measured(Target):
         like them has a loss of about 1. error: of measurement, of the mean; by default 0, as of
         counts. The rest is as of `Measured`. Raises InputError for other names and numbers.
         """
-        found, counts = {}, {}
+        rows = {}
         if not isinstance(functions, Mapping) or not functions:
             rule = "a dict of functions by name, such as {'donors': donors}"
             raise checks.input_error("Measured.of_colonies: functions", functions, rule)
         for name, numbers in checked_columns("Measured.of_colonies: values", values, functions):
             label = f"Measured.of_colonies: values[{name!r}]"
-            row = np.asarray(checks.vector(label, numbers))
-            found[name], counts[name] = mean_and_spread(label, row[None]), len(row)
-        if len(set(counts.values())) > 1:
-            rule = "as many numbers of each, one for each colony"
-            raise checks.input_error("Measured.of_colonies: values", counts, rule)
-        wanted, spread = ({name: float(x[k][0]) for name, x in found.items()} for k in (0, 1))
+            rows[name] = np.asarray(checks.vector(label, numbers))[None]
+        rule = "as many numbers of each, one for each colony"
+        means, spreads, colonies = means_and_spreads("Measured.of_colonies: values", rows, rule)
+        wanted, spread = ({n: float(x[0]) for n, x in of.items()} for of in (means, spreads))
         return Measured(
             functions, wanted, spread, extinct=extinct, smooth=smooth, time=time,
-            colonies=next(iter(counts.values())),
+            colonies=colonies,
             error=dict.fromkeys(functions, 0.0) if error is None else error,
         )  # fmt: skip
 
@@ -263,7 +261,20 @@ def checked_columns(
     return [(name, given[name]) for name in functions]
 
 
-def mean_and_spread(label: str, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def means_and_spreads(
+    label: str, rows: Mapping[str, np.ndarray], alike: str
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], int]:
+    """Means and spreads by name, (T,) each, of numbers by time and colony (T, C), and the number of
+    colonies. alike: what the numbers must be, where they are not of as many colonies."""
+    found = {name: _mean_and_spread(f"{label}[{name!r}]", x) for name, x in rows.items()}
+    counts = {name: x.shape[1] for name, x in rows.items()}
+    if len(set(counts.values())) > 1:
+        raise checks.input_error(label, counts, alike)
+    means, spreads = ({name: pair[k] for name, pair in found.items()} for k in (0, 1))
+    return means, spreads, next(iter(counts.values()))
+
+
+def _mean_and_spread(label: str, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The means of a measure over colonies, (T,), of its numbers at each time (T, C), and how much
     colonies differ, (T,)."""
     if rows.shape[1] < ENOUGH:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import torchfilm as tf
-from design.targets.measured import Measured, checked_columns, mean_and_spread
+from design.targets.measured import Measured, checked_columns, means_and_spreads
 from design.targets.observed import Observed
 from torchfilm import checks
 
@@ -130,7 +130,7 @@ def _of_colonies(
     if spread is not None:
         rule = "left out where values are given of each colony, which tell how much these differ"
         raise checks.input_error(f"{MEASURES}: spread", spread, rule)
-    found, counts = {}, {}
+    by_name = {}
     for name, given in values.items():
         label = f"{MEASURES}: values[{name!r}]"
         rule = (
@@ -143,11 +143,8 @@ def _of_colonies(
         missing = np.isnan(rows)
         if len(rows) != len(moments) or (missing.any(1) != missing.all(1)).any():
             raise checks.input_error(label, given, rule)
-        found[name], counts[name] = mean_and_spread(label, rows), rows.shape[1]
-    if len(set(counts.values())) > 1:
-        raise checks.input_error(f"{MEASURES}: values", counts, "numbers of as many colonies each")
-    means, spreads = ({name: pair[k] for name, pair in found.items()} for k in (0, 1))
-    return means, spreads, next(iter(counts.values()))
+        by_name[name] = rows
+    return means_and_spreads(f"{MEASURES}: values", by_name, "numbers of as many colonies each")
 
 
 def _columns(option: str, given: Any, functions: Mapping[str, Any], count: int) -> dict[str, Any]:
