@@ -252,7 +252,7 @@ def _cannot_be_built(
         hints += (
             " If the scene takes a plain number or a name there, use whole=True or a Choice: a"
             " Parameter, and a number of Conditions, arrive as a tensor with one value per colony,"
-            " which cannot say how many founders there are."
+            " of which founders are made by tf.Founders(function, name=value)."
         )
     return tf.InputError(
         f"{kind}{str(error).rstrip('.')}. So the scene cannot be built with {changed or values}."

@@ -6,6 +6,7 @@ import torch
 
 import torchfilm as tf
 from design import OnFraction, Parameter, Search
+from design.targets import Composition, Conditions
 
 RADIUS = 8.0
 
@@ -70,7 +71,7 @@ def test_a_model_bound_to_a_state_starts_from_the_same():
 
 def test_a_scene_keeps_the_function():
     other = scene().replace(dt=0.05)
-    assert other.draw is mixed and "6 founder(s), drawn for each colony" in other.headline
+    assert other.draw.function is mixed and "6 founder(s), drawn for each colony" in other.headline
     assert scene() == scene() and scene() != scene(lambda seed: tf.inoculum(6, 4.0, seed=seed))
     given = scene().replace(founders=tf.inoculum(3, RADIUS))
     assert given.draw is None and given.founders.count == 3
@@ -139,8 +140,121 @@ def test_all_have_the_same_columns():
     def odd(seed):
         return tf.inoculum(2, 9.0, seed=seed) if seed == 0 else mixed(seed)
 
-    with pytest.raises(tf.InputError, match=r"columns cell_type, position; founders\(0\) gave"):
+    with pytest.raises(tf.InputError, match=r"columns cell_type, position; those of colony 0"):
         scene(odd).bind(2)
+
+
+def shared(seed, share, count=10):
+    return tf.inoculum(round(count), RADIUS, types={0: 1 - share, 1: share}, seed=seed)
+
+
+def strains(state: tf.State) -> list[tuple[int, int]]:
+    """How many cells of each type each colony has."""
+    kinds = [state.cell_type[state.colony == k] for k in range(state.colonies)]
+    return [(int((kind == 0).sum()), int((kind == 1).sum())) for kind in kinds]
+
+
+@pytest.mark.parametrize("form", [list, np.array, torch.tensor, lambda x: tf.PerColony(x)])
+def test_they_may_differ_between_colonies(form):
+    founders = tf.Founders(shared, share=form([0.0, 0.5, 1.0]), count=form([4, 8, 2]))
+    first = scene(founders).bind().start()
+    assert strains(first) == [(4, 0), (4, 4), (0, 2)]
+
+
+def test_colonies_of_one_stream_differ_by_their_values_alone():
+    def placed(seed, share):
+        cells = tf.inoculum(4, RADIUS, seed=seed)
+        return tf.Cells(cells.position, cells.axis, extra={"lit": np.full(4, share)})
+
+    founders = tf.Founders(placed, share=[0.2, 0.8])
+    first = scene(founders).bind(streams=[3, 3]).start()
+    assert torch.equal(places(first, 0), places(first, 1))
+    assert first.lit.tolist() == pytest.approx(4 * [0.2] + 4 * [0.8])
+    alone = scene(tf.Founders(placed, share=0.8)).bind(1, streams=[3]).start()
+    assert torch.equal(places(alone, 0), places(first, 1)) and torch.equal(alone.lit, first.lit[4:])
+
+
+def test_values_for_all_colonies_leave_their_number_open():
+    founders = tf.Founders(shared, share=0.25, count=4)
+    assert strains(scene(founders).bind(2).start()) == [(3, 1), (3, 1)]
+    assert scene(founders) == scene(tf.Founders(shared, share=0.25, count=4))
+    assert scene(founders) != scene(tf.Founders(shared, share=0.5, count=4))
+
+
+def test_their_numbers_are_kept_with_the_results(tmp_path):
+    given = scene(tf.Founders(shared, share=[0.5, 0.25], count=4))
+    for _ in tf.simulate(given, until=0.5, record=tmp_path / "run.h5"):
+        pass
+    with tf.Results(tmp_path / "run.h5") as results:
+        table = results.table()
+        state = results.state(given)
+    assert all(table["share"] == np.where(table["colony"] == 0, 0.5, 0.25))
+    *_, whole = tf.simulate(given, until=1.0)
+    *_, end = tf.simulate(given, state, until=1.0)
+    assert torch.equal(whole.position, end.position)
+
+
+def test_a_search_varies_them():
+    """Of cells that grow alike the composition at the end is that of the founders."""
+
+    def family(share, count):
+        return scene(tf.Founders(shared, share=share, count=count))
+
+    spaces = [Parameter("share", 0.2, 0.9), Parameter("count", 6, 12)]
+    search = Search(
+        family, spaces, Composition({0: 0.3, 1: 0.7}), until=0.2, dt=0.1, replicates=2, seed=0
+    )
+    best = search.run(colonies=60, progress=False)
+    assert best.values["share"] == pytest.approx(0.7, abs=0.1)
+    assert "its founders differ between colonies" in best.table()
+    ends = [c.state for c in best.colonies()]
+    wanted = round(best.values["count"]), best.values["share"]
+    assert all(sum(pair) == wanted[0] for s in ends for pair in strains(s))
+    assert all(abs(two / (one + two) - wanted[1]) < 0.1 for s in ends for one, two in strains(s))
+
+
+def test_conditions_set_them():
+    """The share of strain 1 under each condition."""
+
+    def family(count, share):
+        return scene(tf.Founders(shared, share=share, count=count))
+
+    both = Conditions(
+        [({"share": 0.2}, Composition({1: 0.2})), ({"share": 0.8}, Composition({1: 0.8}))]
+    )
+    search = Search(family, [Parameter("count", 9.6, 10.4)], both, until=0.2, dt=0.1, replicates=1)
+    best = search.run(colonies=4, progress=False)
+    assert best.loss < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: tf.Founders(shared, count=4), "a seed and of count.*missing.*'share'"),
+        (lambda: tf.Founders(mixed, share=[0.5]), "a seed and of share"),
+        (lambda: tf.Founders(tf.Cells), "must be Cells, or a function from a seed to Cells"),
+        (lambda: tf.Founders(shared, share=[]), "Founders.share = .*a value for each colony"),
+        (lambda: tf.Founders(shared, share=[[0.5]]), r"share\[0\] = .*one value for each.*tuple"),
+        (lambda: tf.Founders(shared, share=[0.5, 0.2], count=[1, 2, 3]), "2 of share, 3 of count"),
+        (
+            lambda: tf.Founders(shared, share=torch.tensor([0.5], requires_grad=True)),
+            "Founders.share = .*without gradients.*no derivatives",
+        ),
+        (
+            lambda: scene(tf.Founders(shared, share=[0.5, 1.5])).bind(),
+            r"types\[0\] = -0.5 .*share=1.5\), for colony 1",
+        ),
+        (
+            lambda: scene(tf.Founders(shared, share=[0.5, 0.2])).bind(3),
+            "2 values per colony.*one value for each of the 3 colonies",
+        ),
+        (lambda: tf.inoculum([3, 4], RADIUS), r"count = \[3, 4\] .*tf\.Founders"),
+        (lambda: scene(shared), "the seed of the colony.*tf.Founders"),
+    ],
+)
+def test_what_values_of_founders_are_refused(make, said):
+    with pytest.raises(tf.InputError, match=said):
+        make()
 
 
 def test_a_gradient_that_founders_lose_is_warned_of():

@@ -195,7 +195,7 @@ def test_types_may_be_numbers_of_cells():
 
 
 def test_a_share_of_which_no_cell_comes_is_warned_of():
-    with pytest.warns(UserWarning, match=r"types\[0\] = 0.01 is so small a share of 30 cells"):
+    with pytest.warns(UserWarning, match=r"types\[0\] is so small a share of the cells"):
         founders = tf.inoculum(30, 15.0, types={0: 0.01, 1: 0.99})
     assert set(founders.cell_type) == {1}
     tf.inoculum(30, 15.0, types={0: 0.0, 1: 1.0})  # none is wanted

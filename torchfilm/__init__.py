@@ -23,6 +23,7 @@ from torchfilm.effects.rules import Rules
 from torchfilm.effects.scaled import Scaled
 from torchfilm.effects.signal import Signal
 from torchfilm.effects.sloughing import Sloughing
+from torchfilm.founders import Founders
 from torchfilm.image_field import ImageField
 from torchfilm.initial_cells import Cells
 from torchfilm.inocula import inoculum
@@ -101,6 +102,7 @@ __all__ = [
     "Erosion",
     "Field",
     "Flux",
+    "Founders",
     "Groups",
     "Growth",
     "GrowthRecording",

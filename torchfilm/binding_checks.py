@@ -258,6 +258,8 @@ def why_not_replayable(model: Model) -> str:
         return f"{anything[0]} may read and write anything"
     if model.scene.founders.colony is not None:
         return "its first cells name their colonies, so that these do not start alike"
+    if model.scene.draw is not None and model.scene.draw.colonies is not None:
+        return "its founders differ between colonies"
     for e in model.effects:
         for f in e.declares():
             if f.scope != CELL and e.place in model.recorded:

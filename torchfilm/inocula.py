@@ -18,6 +18,7 @@ from torchfilm.tools import checks
 from torchfilm.tools.warn_once import warn
 from torchfilm.values import Distribution
 
+DIFFERENT = "For numbers that differ between colonies: tf.Founders(function, count=[…])."
 ROUNDS = 2000  # in which cells that overlap others are placed again
 
 
@@ -56,7 +57,7 @@ def inoculum(
     room: rods placed one after the other at random fill at most about 45 % of an area, 30 % of a
     volume. Warns of a share of which no cell comes.
     """
-    checks.integer("count", count, least=1)
+    checks.integer("count", count, least=1, hint=DIFFERENT)
     checks.integer("colonies", colonies, least=1)
     checks.choice("dim", dim, (2, 3))
     checks.integer("seed", seed, least=0)
@@ -198,8 +199,9 @@ def _shares(types: object, count: int) -> dict[int, float] | None:
     numbers = dict(zip(shares, _numbers(count, shares), strict=True))
     if none := [kind for kind, share in shares.items() if share > 0 and not numbers[kind]]:
         warn(
-            f"types[{none[0]}] = {shares[none[0]]:g} is so small a share of {count} cells that none"
-            f" comes. Take more cells, or give numbers, such as types={{{none[0]}: 1, …}}."
+            # without the numbers, so that the colonies of a search warn once
+            f"types[{none[0]}] is so small a share of the cells that none comes. Take more cells,"
+            f" or give numbers, such as types={{{none[0]}: 1, …}}."
         )
     return shares
 

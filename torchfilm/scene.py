@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from numbers import Real
 from typing import Any, ClassVar
 
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchfilm.circuits.names import without_medium
 from torchfilm.effect import BUILT_IN, Effect, is_own
-from torchfilm.founders import Draw, one_draw
+from torchfilm.founders import Founders
 from torchfilm.initial_cells import Cells
 from torchfilm.model import Model, bind
 from torchfilm.parameters import given, parameters, summary
@@ -40,7 +40,8 @@ class Scene(metaclass=checks.KnownKeywords):
 
     name: for results. dt: default step, h. founders: cells that each colony starts from; by default
     one cell, 2 µm long; or a function from a seed to such cells, which is called for each colony
-    with a seed of its stream: `founders=lambda seed: tf.inoculum(12, 10.0, seed=seed)`. dim: 2 or
+    with a seed of its stream: `founders=lambda seed: tf.inoculum(12, 10.0, seed=seed)`; or a
+    tf.Founders, whose function has further values, which may differ between colonies. dim: 2 or
     3, for a scene without mechanics. recipe: (name, parameters) of a ready-made scene, from which
     `resume` builds it again. settings: what the user's own scene function was given. accuracy:
     accuracy settings applied so far.
@@ -53,8 +54,8 @@ class Scene(metaclass=checks.KnownKeywords):
     name: str
     dt: float
     dim: int
-    founders: Cells  # where they are drawn, those of the seed 0
-    draw: Draw | None
+    founders: Cells  # where they are drawn, those of the first colony from the seed 0
+    draw: Founders | None
     recipe: tuple[str, dict[str, Any]] | None
     settings: dict[str, Any]
     accuracy: dict[str, float]
@@ -70,7 +71,7 @@ class Scene(metaclass=checks.KnownKeywords):
         *effects: Effect,
         name: str = "scene",
         dt: float = 0.025,
-        founders: Cells | Draw | None = None,
+        founders: Cells | Founders | Callable[[int], Cells] | None = None,
         dim: int | None = None,
         recipe: tuple[str, dict[str, Any]] | None = None,
         settings: dict[str, Any] | None = None,
@@ -88,11 +89,8 @@ class Scene(metaclass=checks.KnownKeywords):
             "draw": None,
         }
         if founders is not None and not isinstance(founders, Cells):
-            if not callable(founders) or isinstance(founders, type):
-                rule = "Cells, or a function from a seed to Cells"
-                hint = "Such as tf.Cells.single(2), or tf.inoculum(…) for several."
-                raise checks.input_error("Scene.founders", founders, rule, hint)
-            made["draw"], founders = founders, one_draw(founders, 0)
+            draw = founders if isinstance(founders, Founders) else Founders(founders)
+            made["draw"], founders = draw, draw.one(0)
         made["dim"] = _dimension(effects, founders, dim)
         made["founders"] = founders if founders is not None else Cells.single(made["dim"])
         if made["founders"].dim != made["dim"]:
@@ -138,7 +136,7 @@ class Scene(metaclass=checks.KnownKeywords):
     @property
     def drawn_from(self) -> Any:
         """What decides the founders: they themselves, or they and the function that draws them."""
-        return self.founders if self.draw is None else (self.founders, self.draw)
+        return self.founders if self.draw is None else (self.founders, *self.draw.decided_by)
 
     def replace(self, *effects: Effect, **changes: Any) -> Scene:
         """The same scene with other effects, if any are given, or with another name, dt, founders,
@@ -198,13 +196,15 @@ class Scene(metaclass=checks.KnownKeywords):
     @property
     def fixed_colonies(self) -> int:
         """How many colonies the parameters or founders are for; 1 where it may be any number."""
-        return max([self.founders.colonies, *(tensor.numel() for _, tensor in self.per_colony())])
+        own = self.founders.colonies if self.draw is None else self.draw.colonies or 1
+        return max([own, *(tensor.numel() for _, tensor in self.per_colony())])
 
     def per_colony(self) -> list[tuple[str, Tensor]]:
-        """Every parameter with one value per colony, by name: "Growth.rate", and of several effects
-        of one kind "Circuit['lux'].parameters['k']"."""
+        """Every parameter with one value per colony, by name: "Growth.rate", of several effects of
+        one kind "Circuit['lux'].parameters['k']", and of founders "Founders.share"."""
         owners = zip(self.effects, _owners(self.effects), strict=True)
-        return [
+        own = [] if self.draw is None else self.draw.per_colony()
+        return own + [
             (path, x) for e, owner in owners for path, x in parameters(e, owner) if x.dim() == 1
         ]
 

@@ -306,7 +306,7 @@ def test_what_takes_one_plain_number_is_no_condition():
 
     cells = Measured({"cells": lambda s: s.counts.double()}, {"cells": 9.0}, {"cells": 1.0})
     several = Conditions([({"n": 10}, cells), ({"n": 40}, cells)])
-    with pytest.raises(tf.InputError, match=r"Conditions, arrive as a tensor .* how many founders"):
+    with pytest.raises(tf.InputError, match=r"Conditions, arrive as a tensor .* tf\.Founders"):
         Task(lambda n=20, k=1.0: crowd(n), [Parameter("k", 0.5, 2.0)], several, until=0.2)
     with pytest.raises(tf.InputError, match="makes of it what it stands for, such as a value of a"):
         Conditions([({"light": tf.Schedule({0: 1.0})}, cells), ({"light": 1.0}, cells)])
