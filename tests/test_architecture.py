@@ -69,6 +69,7 @@ ROOMS = {
             "torchfilm.turns",
             "torchfilm.together",
             "torchfilm.binding_checks",
+            "torchfilm.arrivals",
             "torchfilm.founders",
             "torchfilm.initial_cells",
             "torchfilm.inocula",

@@ -151,6 +151,22 @@ class FirstCells:
         return draw.of_streams(self.seed, streams, self.scene.founders)
 
 
+def checked_streams(given: Sequence[int] | Tensor | None, colonies: int) -> Tensor | None:
+    """Which stream each colony follows, (B,) int64; None for its own. Raises InputError."""
+    if given is None:
+        return None
+    found = torch.as_tensor(given)
+    integers = not (found.is_floating_point() or found.dtype == torch.bool)
+    if found.shape != (colonies,) or not integers or bool(((found < 0) | (found >= 2**32)).any()):
+        raise checks.input_error(
+            "streams",
+            given,
+            f"{colonies} integers from 0 to 2³² − 1, one for each colony",
+            f"Give colonies={len(found)}, too." if colonies == 1 < found.numel() else "",
+        )
+    return found.to(torch.int64)
+
+
 def _each(name: str, given: Any) -> Any:
     """A value as founders are told it: a list of one per colony, or what is for all."""
     if isinstance(given, PerColony):

@@ -21,16 +21,17 @@ import torch
 from torch import Tensor
 
 from torchfilm import binding_checks
+from torchfilm.arrivals import with_arrivals
 from torchfilm.cpu_parts import CpuTwins, OnCpu
 from torchfilm.effect import BUILT_IN, DIVISION, FLAGGED_DIVISION, Binding, BoundEffect
-from torchfilm.founders import FirstCells
+from torchfilm.founders import FirstCells, checked_streams
 from torchfilm.initial_cells import Cells
 from torchfilm.joined_step import JoinedStep, joined
 from torchfilm.resolver import BoundBatch
 from torchfilm.state import CELL, PER_CELL, Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.hashing import digest
-from torchfilm.tools.row_checks import check_declared, check_geometry
+from torchfilm.tools.row_checks import Rows, check_declared, check_geometry
 from torchfilm.tools.threads import after_fork, one_torch_thread
 from torchfilm.tools.times import later
 from torchfilm.tools.timing import Timings
@@ -102,12 +103,25 @@ class Model:
                 state = effect.run_step(state, dt, timings)
         return advanced(state, dt)
 
+    def add(self, state: State, cells: Cells, colonies: Rows | None = None) -> State:
+        """The state with further cells, which come from outside, as settlers do.
+
+        cells: as founders are given; to each of `colonies`, by their places, comes a copy of all
+        (default: to every colony). Or they have colony numbers, the places of their own. They have
+        new numbers, no parent, and first values as founders have. Contacts push apart what lies in
+        one another. Raises InputError for cells that may not be where they are, lack a column that
+        the founders brought, or bring one that the state lacks.
+        """
+        return with_arrivals(self, state, cells, colonies)
+
     def opened(self, state: State) -> State:
         """The state as a step of this model begins, also where another model made it."""
         binding_checks.check_fits(state, self, self.first_fields)
         declared = {**state.declared, **self.first_fields}
         new = {"declared": declared, "space": self._space}
-        state = state.replace(births=(), ended=(), reports={}, **new)
+        # what came since the last step, the next one is told of
+        come = tuple(x for x in state.arrived if x.step == state.step)
+        state = state.replace(births=(), ended=(), arrived=come, reports={}, **new)
         for effect in self._openers:
             state = effect.opened(state)
         return state
@@ -364,7 +378,7 @@ def bind(
     if founders.dim != scene.dim:
         raise checks.input_error("cells", f"{founders.dim}-D", f"{scene.dim}-D, as the scene is")
     batch = BoundBatch(count, dtype, checks.device(device), _types(founders), per_colony)
-    start = FirstCells(count, seed, _streams(streams, count), scene, cells)
+    start = FirstCells(count, seed, checked_streams(streams, count), scene, cells)
     model = Model(scene, batch, start, only)
     first = model.trace(None)
     if only is None:  # a part of a scene lacks what the rest of it declares
@@ -409,21 +423,6 @@ def _count(
 
 def _types(founders: Cells) -> tuple[int, ...]:
     return () if founders.cell_type is None else tuple(sorted({int(k) for k in founders.cell_type}))
-
-
-def _streams(given: Sequence[int] | Tensor | None, colonies: int) -> Tensor | None:
-    if given is None:
-        return None
-    found = torch.as_tensor(given)
-    integers = not (found.is_floating_point() or found.dtype == torch.bool)
-    if found.shape != (colonies,) or not integers or bool(((found < 0) | (found >= 2**32)).any()):
-        raise checks.input_error(
-            "streams",
-            given,
-            f"{colonies} integers from 0 to 2³² − 1, one for each colony",
-            f"Give colonies={len(found)}, too." if colonies == 1 < found.numel() else "",
-        )
-    return found.to(torch.int64)
 
 
 def _with_given(state: State, wanted: Field) -> State:

@@ -285,6 +285,11 @@ class Replay(metaclass=checks.KnownKeywords):
         place = self.order.index_select(0, torch.searchsorted(self.streams, state.stream))
         followed = _Followed(place)
         changes = {change.part: change for change in self.recording.changes(number)}
+        if state.ended or state.arrived:
+            raise checks.InputError(
+                "cells were removed from the state, or added to it, but growth was recorded with"
+                " those that there were. Step the model itself: replay.model.step(state)."
+            )
         state = self.model.opened(state)
         if FIRST in changes:
             state = self._apply(state, changes[FIRST], followed)

@@ -15,7 +15,7 @@ from torchfilm import state_colonies
 from torchfilm.physics import capsule
 from torchfilm.physics.space import PeriodicSpace
 from torchfilm.signals.layout import Contact, Layout, Signals
-from torchfilm.state_colonies import CELL, COLONY, GRID, PER_COLONY, Ended, note_of
+from torchfilm.state_colonies import CELL, COLONY, GRID, PER_COLONY, Arrived, Ended, note_of
 from torchfilm.tools import checks, displays, random, row_checks, tangents
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.read_only import read_only
@@ -122,6 +122,7 @@ class State:
     space: PeriodicSpace | None = None
     births: tuple[Births, ...] = ()
     ended: tuple[Ended, ...] = ()
+    arrived: tuple[Arrived, ...] = ()
     reports: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -362,12 +363,13 @@ class State:
         off: also without those of columns such as growth_rate, by which derivatives by Growth.rate
         go on."""
         cut = self.moved(lambda part: part.detach() if isinstance(part, Tensor) else part)
-        return cut.replace(births=(), ended=(), reports={})
+        return cut.replace(births=(), ended=(), arrived=(), reports={})
 
     def to(self, device: str | torch.device) -> State:
         """The same state on another device."""
         device = checks.device(device)
-        return self.moved(lambda part: part.to(device)).replace(births=(), ended=(), reports={})
+        here = self.moved(lambda part: part.to(device))
+        return here.replace(births=(), ended=(), arrived=(), reports={})
 
     def moved(self, move: Callable[[Any], Any]) -> State:
         """The state with each tensor, and its layout, as a function returns it."""

@@ -31,6 +31,18 @@ class Ended:
     cell_type: Tensor | None
 
 
+@dataclass(frozen=True)
+class Arrived:
+    """Cells that came from outside, not by division: colony ids, uids and lengths (M,); the step
+    and the time, h, at which they came."""
+
+    colony_id: Tensor
+    uid: Tensor
+    length: Tensor
+    step: int
+    time: float
+
+
 def note_of(state: State, rows: Tensor, fate: str) -> Ended:
     """That the cells `rows` (M,) of a state leave."""
     colony = state.colony_id.index_select(0, state.colony.index_select(0, rows))
@@ -58,6 +70,7 @@ def selected(state: State, places: Tensor) -> State:
         layout=layout,
         births=(),
         ended=(),
+        arrived=(),
         reports={},
         **{name: getattr(state, name).index_select(0, places) for name in PER_COLONY},
     )

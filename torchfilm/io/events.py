@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchfilm.io.layout import numpy_of
 from torchfilm.state import FATES, State
-from torchfilm.state_colonies import Ended
+from torchfilm.state_colonies import Arrived, Ended
 from torchfilm.tools import checks
 
 Rows = tuple[np.ndarray, ...]  # the columns of `layout.LINEAGE`, in their order
@@ -18,7 +18,7 @@ Rows = tuple[np.ndarray, ...]  # the columns of `layout.LINEAGE`, in their order
 
 def births_of(state: State) -> list[Rows]:
     """The births of a step."""
-    found = []
+    found: list[Rows] = []
     for b in state.births:
         parents = torch.cat([b.parents.uid, b.parents.uid])
         ids = torch.cat([b.parents.own_colony_id, b.parents.own_colony_id])
@@ -26,6 +26,27 @@ def births_of(state: State) -> list[Rows]:
         own = (numpy_of(x) for x in (ids, b.uid, parents))
         found.append((*own, steps, numpy_of(b.length), times))
     return found
+
+
+def arrivals_of(come: Iterable[Arrived]) -> list[Rows]:
+    """Cells that came from outside, as births without a parent."""
+    found: list[Rows] = []
+    for a in come:
+        none, steps, times = (np.full(a.uid.numel(), x) for x in (-1, a.step, a.time))
+        ids, uid, length = (numpy_of(x) for x in (a.colony_id, a.uid, a.length))
+        found.append((ids, uid, none, steps, length, times))
+    return found
+
+
+def just_arrived(state: State) -> list[Arrived]:
+    """What was added to a state since its step."""
+    return [a for a in state.arrived if a.step == state.step]
+
+
+def arrived_since(before: State, state: State) -> list[Arrived]:
+    """What was added between two states of consecutive steps. A run may go on from a state with
+    cells that were added to it: they are there before."""
+    return [*state.arrived[len(just_arrived(before)) :]]
 
 
 def ends_of(state: State, ended: Iterable[Ended]) -> list[Rows]:
@@ -46,7 +67,8 @@ def removed_before(state: State, before: State) -> list[Ended]:
     did not end in the step."""
     ended = sum(e.uid.numel() for e in state.ended)
     born = sum(b.uid.numel() for b in state.births)
-    if state.cells == before.cells + born - ended:
+    come = sum(a.uid.numel() for a in arrived_since(before, state))
+    if state.cells == before.cells + born + come - ended:
         return []
     there = _keys([(state.own_colony_id, state.uid), *((e.colony_id, e.uid) for e in state.ended)])
     own = zip(before.own_colony_id.tolist(), before.uid.tolist(), strict=True)
@@ -77,9 +99,15 @@ def _keys(parts: Iterable[tuple[Tensor, Tensor]]) -> set[tuple[int, int]]:
     return {key for ids, uid in parts for key in zip(ids.tolist(), uid.tolist(), strict=True)}
 
 
+def numbers_of(come: Iterable[Arrived], state: State) -> Tensor:
+    """How many of these cells came to each colony of a state, (B,)."""
+    ids = torch.cat([state.colony_id.new_empty(0), *(a.colony_id for a in come)])
+    return (ids.unsqueeze(0) == state.colony_id.unsqueeze(1)).sum(1)
+
+
 def check_course(before: State, state: State) -> None:
     """Raise InputError where colonies are others than a step ago, or have cells that were neither
-    there, nor born in this step: the lineage would lead nowhere."""
+    there, nor born in this step or added before it: the lineage would lead nowhere."""
     if not torch.equal(before.colony_id, state.colony_id):
         raise checks.InputError(
             f"the run has the colonies {_listed(state.colony_id)} at step {state.step}, and had"
@@ -87,8 +115,9 @@ def check_course(before: State, state: State) -> None:
             " results have the same colonies: record what each colony does to a file of its own, or"
             " remove the cells of those that are done (state.remove)."
         )
-    born = sum(b.parents.groups.counts for b in state.births)
-    strange = state.next_uid != before.next_uid + 2 * born
+    made = sum(2 * b.parents.groups.counts for b in state.births)
+    made = made + numbers_of(arrived_since(before, state), state)
+    strange = state.next_uid != before.next_uid + made
     if not bool(strange.any()):
         return
     raise checks.InputError(

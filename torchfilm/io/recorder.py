@@ -12,8 +12,7 @@ import h5py
 import numpy as np
 import torch
 
-from torchfilm.io import replacing
-from torchfilm.io.events import Rows, absent_from, births_of, check_course, ends_of, removed_before
+from torchfilm.io import events, replacing
 from torchfilm.io.identity import scene_attributes
 from torchfilm.io.layout import (
     AT_CELLS,
@@ -85,8 +84,8 @@ class Recorder(metaclass=checks.KnownKeywords):
         self.first_step = 0
         self.tables: dict[str, h5py.Dataset] = {}
         # events since the last frame that is written
-        self.births: list[Rows] = []
-        self.ends: list[Rows] = []
+        self.births: list[events.Rows] = []
+        self.ends: list[events.Rows] = []
         self.absent: list[
             Ended
         ] = []  # of the last frame, where the state that resumes it lacks them
@@ -138,14 +137,15 @@ class Recorder(metaclass=checks.KnownKeywords):
 
     def __call__(self, state: State) -> None:
         if self.file is not None and self.last is not None:
-            check_course(self.last, state)  # the file ends with the last state before
+            events.check_course(self.last, state)  # the file ends with the last state before
         before, self.last = self.last, state
         if self.file is None:
             self._open(state)  # earlier events belong to no frame of this run
             return
-        by_hand = [] if before is None else removed_before(state, before)
-        self.births += births_of(state)
-        self.ends += ends_of(state, [*self.absent, *by_hand, *state.ended])
+        by_hand = [] if before is None else events.removed_before(state, before)
+        come = [] if before is None else events.arrived_since(before, state)
+        self.births += events.arrivals_of(come) + events.births_of(state)
+        self.ends += events.ends_of(state, [*self.absent, *by_hand, *state.ended])
         self.absent = []
         if (state.step - self.first_step) % self.every == 0:
             self._write(state)
@@ -240,7 +240,8 @@ class Recorder(metaclass=checks.KnownKeywords):
         """A copy of the file, which ends with this state."""
         with Results(self.path) as kept:
             self._check_resumed(kept, state)
-            self.absent = absent_from(state, kept.frame(), kept.colony_id)
+            self.absent = events.absent_from(state, kept.frame(), kept.colony_id)
+            self.births += events.arrivals_of(events.just_arrived(state))
             self.written, self.first_step = int(kept.steps[-1]), int(kept.steps[0])
         check_room(
             self.target, self.target.stat().st_size, f"to resume {self.path}, by a copy of it",
@@ -296,7 +297,11 @@ class Recorder(metaclass=checks.KnownKeywords):
         keys = lambda ids, uid: {*zip(ids.tolist(), uid.tolist(), strict=True)}
         frame = kept.frame()
         known = keys(kept.colony_id[frame["colony"]], frame["uid"])
-        same = np.array_equal(kept.next_uid(), numpy_of(state.next_uid))
+        come = events.just_arrived(state)
+        known |= {key for a in come for key in keys(a.colony_id, a.uid)}
+        same = np.array_equal(
+            kept.next_uid(), numpy_of(state.next_uid - events.numbers_of(come, state))
+        )
         if not same or not keys(state.own_colony_id, state.uid) <= known:
             raise checks.input_error(
                 "state", "with other cells", f"of cells of the last frame of {self.path}",
@@ -400,9 +405,9 @@ class Recorder(metaclass=checks.KnownKeywords):
             self._append(f"cells/{name}", value, first_row)
         for name, value in found_columns(state).items():
             self._append(f"{AT_CELLS}/{name}", value, first_row)
-        for table, events in (("births", self.births), ("ends", self.ends)):
+        for table, found in (("births", self.births), ("ends", self.ends)):
             names, none = LINEAGE[table], np.empty(0, np.int64)
-            merged = [np.concatenate(c) for c in zip(*events, strict=True)] or [none] * len(names)
+            merged = [np.concatenate(c) for c in zip(*found, strict=True)] or [none] * len(names)
             for name, value in zip(names, merged, strict=True):
                 if f"lineage/{table}/{name}" in file:  # older files have no lengths, or times
                     self._append(f"lineage/{table}/{name}", value, sizes[table])
