@@ -95,7 +95,8 @@ class Model:
         after_fork()
         if dt not in (None, self.dt):  # a check takes as long as a small effect
             checks.number("dt", dt, least=0.0)
-        dt, state = self.dt if dt is None else dt, self.opened(state)
+        dt = self.dt if dt is None else dt
+        state = self.opened(state, dt)
         # torch's threads are set once a step, not once an effect
         alone = one_torch_thread() if self._by_kernels else nullcontext()
         with alone, once(self._said) as self._said:
@@ -114,11 +115,12 @@ class Model:
         """
         return with_arrivals(self, state, cells, colonies)
 
-    def opened(self, state: State) -> State:
-        """The state as a step of this model begins, also where another model made it."""
+    def opened(self, state: State, dt: float) -> State:
+        """The state as a step of dt hours of this model begins, also where another model made
+        it."""
         binding_checks.check_fits(state, self, self.first_fields)
         declared = {**state.declared, **self.first_fields}
-        new = {"declared": declared, "space": self._space}
+        new = {"declared": declared, "space": self._space, "span": (state.time, state.time + dt)}
         # what came since the last step, the next one is told of
         come = tuple(x for x in state.arrived if x.step == state.step)
         state = state.replace(births=(), ended=(), arrived=come, reports={}, **new)
@@ -345,7 +347,8 @@ def advanced(state: State, dt: float) -> State:
     """The state with its fields checked and its step counted; evenly, so that time gathers no
     rounding."""
     state.check_fields()
-    return state.replace(step=state.step + 1, time=later(state.time, state.step, dt), dt=dt)
+    time = later(state.time, state.step, dt)
+    return state.replace(step=state.step + 1, time=time, dt=dt, span=None)
 
 
 @one_torch_thread()
@@ -404,7 +407,7 @@ def _bind_to_state(scene: Scene, state: State, only: Collection[int] | None) -> 
     model = Model(scene, batch, FirstCells(count, state.seed, streams, scene, None), only)
     model.check(state)
     # what it can be tried on: cells that there are, or else the founders
-    tried = model.trace(model.opened(state) if state.cells else None)
+    tried = model.trace(model.opened(state, 0.0) if state.cells else None)
     if only is None:
         there = (*scene.declared_by, *state.fields)
         binding_checks.check_names(model.effects, there, tried)

@@ -134,7 +134,7 @@ class GrowthRecording(metaclass=checks.KnownKeywords):
     def _step(self, state: State) -> State:
         """The state one step later; what each effect changed is kept. The same step may be done
         again, with the same result."""
-        state = self.model.opened(state)
+        state = self.model.opened(state, self.dt)
         noted: list[RecordedChange] = []
         failed = {s: (at, why) for s, (at, why) in self.failed.items() if at < state.step}
         full = torch.tensor([s in failed for s in self.streams], device=state.device)
@@ -290,7 +290,7 @@ class Replay(metaclass=checks.KnownKeywords):
                 "cells were removed from the state, or added to it, but growth was recorded with"
                 " those that there were. Step the model itself: replay.model.step(state)."
             )
-        state = self.model.opened(state)
+        state = self.model.opened(state, self.dt)
         if FIRST in changes:
             state = self._apply(state, changes[FIRST], followed)
         for effect, part in self.parts:

@@ -158,8 +158,14 @@ class Scheduled(Resolved):
     each: tuple[Resolved, ...] = field(kw_only=True)
 
     def now(self, state: State) -> Resolved:
-        """What holds at the time of a state."""
-        return self.each[self.schedule.place(state.time)]
+        """What holds at the time of a state; during a step, the mean over its time."""
+        if state.span is None:
+            return self.each[self.schedule.place(state.time)]
+        shares = self.schedule.shares(*state.span)
+        if len(shares) == 1:
+            return self.each[shares[0][0]]
+        parts = [share * held for k, share in shares if (held := self.each[k].value) is not None]
+        return dataclasses.replace(self.each[shares[0][0]], value=sum(parts[1:], parts[0]))
 
     def of_colonies(self, state: State) -> Tensor:
         return self.now(state).of_colonies(state)

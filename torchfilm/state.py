@@ -100,6 +100,7 @@ class State:
     colony_id; colonies of one stream and alike in their parameters are alike in all. next_uid (B,).
     A field is also an attribute: `state.growth_rate`. layout: of the voxels of a medium, where
     `state.signals["ahl"]` (nodes,) is. space: if it is periodic. dt: h, of the step that led here.
+    span: during a step, the times, h, over which inputs that change in time are averaged.
     """
 
     colony: Tensor
@@ -116,6 +117,7 @@ class State:
     step: int = 0
     time: float = 0.0
     dt: float = 0.0
+    span: tuple[float, float] | None = None
     fields: Mapping[str, Tensor] = field(default_factory=dict)
     declared: Mapping[str, Field] = field(default_factory=dict)
     layout: Layout | None = None

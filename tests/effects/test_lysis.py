@@ -122,7 +122,7 @@ def test_a_schedule_of_the_rate():
     scene = tf.Scene(tf.Lysis(rate=pulse), founders=FOUR, dim=2)
     course = [state.cells for state in tf.simulate(scene, until=0.5, dt=0.1)]
     assert course == [4, 4, 0, 0, 0]
-    with pytest.warns(UserWarning, match=r"Lysis\.rate has the value of 0\.2 h in no step"):
+    with pytest.warns(UserWarning, match=r"Lysis\.rate has the value of 0\.2 h for 0\.1 h, less"):
         for _ in tf.simulate(scene, until=0.3, dt=0.15):
             pass
 

@@ -189,13 +189,13 @@ def test_constants_of_rates_and_rules_take_its_value(backend, method):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_change_in_the_middle_of_a_step_is_seen_there_in_any_dtype(dtype):
+def test_the_dose_of_pulses_shorter_than_a_step_is_exact_in_any_dtype(dtype):
     """At 40 times 0.1 k + 0.05, which float32 does not hold exactly."""
     light = tf.Schedule({0: 0.0, 0.05: 1.0}, period=0.1)
     circuit = tf.Circuit(summed, species="dye", light=light, dilution=False)
-    with pytest.warns(UserWarning, match=r"has the value of 0 h in no step of 0\.1 h: it is lost"):
+    with pytest.warns(UserWarning, match=r"of 0 h for 0\.05 h, less than a step of 0\.1 h"):
         end = runs(tf.Scene(circuit, dim=2), 4.0, dt=0.1, dtype=dtype)
-    assert float(end.dye) == pytest.approx(4.0, rel=1e-5)
+    assert float(end.dye) == pytest.approx(2.0, rel=1e-5)
 
 
 def test_values_by_colony_and_by_type():
@@ -327,14 +327,15 @@ def test_a_change_at_a_part_of_a_step_is_followed():
     assert ends[0] == pytest.approx(ends[1], rel=1e-3)
 
 
-def test_a_lost_dose_of_a_rule_is_warned_of():
+def test_a_short_dose_of_a_rule_is_given_and_warned_of():
     def take(cells):
         cells.got = cells.got + cells.p.dose * cells.dt
 
     dose = {"dose": tf.Schedule({0: 0.0, 0.51: 5.0, 0.52: 0.0})}
     rules = tf.Rules(take, variables={"got": 0.0}, parameters=dose)
-    with pytest.warns(UserWarning, match=r"Rules.dose has the value of 0.51 h in no step"):
-        runs(tf.Scene(rules, dim=2), 0.1)
+    with pytest.warns(UserWarning, match=r"Rules.dose has the value of 0.51 h for 0.01 h"):
+        end = runs(tf.Scene(rules, dim=2), 1.0, dt=0.1)
+    assert float(end.got) == pytest.approx(0.05, rel=1e-5)
 
 
 def test_a_change_within_a_step_is_warned_of():
@@ -348,7 +349,7 @@ def test_a_change_within_a_step_is_warned_of():
     with pytest.warns(UserWarning, match=r"source of food has the value of 0\.105 h in no step of"):
         runs(grown(medium(lost, "source")), 0.2)
     drug = tf.Circuit(summed, species="dye", light=lost)
-    with pytest.warns(UserWarning, match=r"Circuit\.light has the value of 0\.105 h in no step"):
+    with pytest.warns(UserWarning, match=r"Circuit\.light has the value of 0\.105 h for 0\.01 h"):
         runs(tf.Scene(drug, dim=2), 0.2)
 
 
@@ -360,17 +361,20 @@ def test_times_that_rounding_has_made_less_count_as_reached():
     assert tf.Schedule({1: 2.0, 0: 1.0})([0.0, 1.0]).tolist() == [1, 2]  # in whichever order
 
 
-def test_what_a_step_takes_at_its_middle_is_not_lost(recwarn):
-    # of steps of 0.2 h one has its middle at 0.3 h, and none begins there
-    short = tf.Schedule({0: 1.0, 0.25: 2.0, 0.35: 3.0})
-    assert short._lost(0.2, 0.5) == [] and short._lost(0.2, 0.0) == [0.25]
-    begins = tf.Schedule({0: 1.0, 0.4: 2.0, 0.45: 3.0})
-    assert begins._lost(0.2, 0.0) == [] and begins._lost(0.2, 0.5) == [0.4]
+def test_what_no_step_of_a_medium_begins_with_is_lost(recwarn):
+    assert tf.Schedule({0: 1.0, 0.25: 2.0, 0.35: 3.0})._lost(0.2) == [0.25]
+    assert tf.Schedule({0: 1.0, 0.4: 2.0, 0.45: 3.0})._lost(0.2) == []
     last = tf.Schedule({0: 1.0, 0.9: 2.0})
-    assert last._lost(0.4, 0.0) == [] == last._lost(0.4, 0.5)
-    assert tf.Schedule({0: 1.0, 0.9: 2.0}, period=1.0)._lost(0.4, 0.0) == [0.9]
+    assert last._lost(0.4) == []
+    assert tf.Schedule({0: 1.0, 0.9: 2.0}, period=1.0)._lost(0.4) == [0.9]
     last.warn_of_step("dose", 0.3)
+    ramp = {0.01 * k: 1.0 * k for k in range(20)}
+    tf.Schedule(ramp).warn_of_mean("dose", 0.1)
+    tf.Schedule({0: 0.0, 0.04: 1.0, 0.15: 0.0}).warn_of_mean("dose", 0.1)
     assert not recwarn.list
+    for peak in (tf.Schedule({**ramp, 0.2: 0.0}), tf.Schedule(ramp, period=0.2)):
+        with pytest.warns(UserWarning, match=r"dose has the value of 0(\.19)? h for 0\.01 h"):
+            peak.warn_of_mean("dose", 0.1)
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ from torchfilm.effects.circuit_report import Failures
 from torchfilm.effects.circuit_words import methods_of, together_lines
 from torchfilm.medium_exchange import Around, Exchanged, MediumExchange, Ramped, form_of
 from torchfilm.resolver import Values, snapshot
-from torchfilm.signals.schedule import Schedule, warn_of_steps
+from torchfilm.signals.schedule import Schedule, warn_of_means
 from torchfilm.state import OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import why_torch
@@ -240,7 +240,7 @@ class BoundCircuit(BoundEffect):
         super().check_step(dt, divides)
         together, circuit = self.plan.transport, self.effect
         dt /= together.medium.steps if together else self.plan.turns
-        warn_of_steps(circuit.value_owner(), circuit.parameters, dt, late=0.5)
+        warn_of_means(circuit.value_owner(), circuit.parameters, dt)
 
     @property
     def why_turns(self) -> str:
@@ -304,7 +304,8 @@ class BoundCircuit(BoundEffect):
     ) -> tuple[State, dict[Kind, Tensor], Surroundings, Taken]:
         """For `changed`: the state half way, the cells by type, what they begin with, and the steps
         that kernels take."""
-        now = state.replace(time=state.time + (done + 0.5) * dt, dt=dt * number)
+        begin = state.time + done * dt
+        now = state.replace(time=begin + 0.5 * dt, dt=dt * number, span=(begin, begin + dt))
         middle, start = self.begun(now, 1.0 / (number - done))
         rows = {k: x for k in self.rates if (x := cells_of_type(state, k)).numel()}
         signals, pool = ({}, None) if medium is None else (medium.first, medium.pool)

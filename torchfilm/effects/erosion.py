@@ -12,7 +12,7 @@ from torchfilm.effect import REMOVAL, Effect
 from torchfilm.film_shape import Columns, Floor, columns_of
 from torchfilm.reports import CellsLost
 from torchfilm.resolver import Values
-from torchfilm.signals.schedule import warn_of_steps
+from torchfilm.signals.schedule import warn_of_means
 from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.deterministic_math import power
@@ -79,7 +79,7 @@ class Erosion(Effect):
         self._ground(state)
 
     def check_step(self, dt: float, divides: bool) -> None:
-        warn_of_steps("Erosion", {"rate": self.rate}, dt)
+        warn_of_means("Erosion", {"rate": self.rate}, dt)
 
     def numerics(self, dt: float, state: State) -> list[str]:
         counts = " × ".join(map(str, self._ground(state).counts))

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchfilm.effect import LYSIS, Binding, BoundEffect, Effect
 from torchfilm.medium_exchange import MediumExchange
 from torchfilm.resolver import Values
-from torchfilm.signals.schedule import warn_of_steps
+from torchfilm.signals.schedule import warn_of_means
 from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.random import fine_uniform
@@ -203,7 +203,7 @@ class Lysis(Effect):
 
     def check_step(self, dt: float, divides: bool) -> None:
         given = {name: value for name, (value, _) in self.physical_values().items()}
-        warn_of_steps("Lysis", given, dt)
+        warn_of_means("Lysis", given, dt)
 
     def check(self, state: State, values: Values) -> None:
         for name in self._variables():

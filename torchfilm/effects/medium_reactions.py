@@ -20,7 +20,7 @@ from torchfilm.circuits.reactions import Reaction
 from torchfilm.circuits.tracing import Untraceable
 from torchfilm.effect import FIRST_REACTIONS, LAST_REACTIONS, Binding, BoundEffect, Effect
 from torchfilm.resolver import snapshot
-from torchfilm.signals.schedule import warn_of_steps
+from torchfilm.signals.schedule import warn_of_means
 from torchfilm.state import OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import check_backend, why_torch
@@ -107,7 +107,7 @@ class MediumReactions(Effect):
         return {n: (v, CONSTANT) for n, v in self.parameters.items()}
 
     def check_step(self, dt: float, divides: bool) -> None:
-        warn_of_steps("MediumReactions", self.parameters, dt)
+        warn_of_means("MediumReactions", self.parameters, dt)
 
     def bind(self, binding: Binding) -> tuple[BoundEffect, ...]:
         before, after = BoundReactions(self, binding), BoundReactions(self, binding)

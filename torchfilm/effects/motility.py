@@ -12,7 +12,7 @@ from torch import Tensor
 from torchfilm.effect import MOTILITY, Binding, BoundEffect, Effect
 from torchfilm.physics import capsule
 from torchfilm.resolver import Values
-from torchfilm.signals.schedule import each_value, warn_of_steps
+from torchfilm.signals.schedule import each_value, warn_of_means
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.random import fine_uniform
@@ -126,7 +126,7 @@ class Motility(Effect):
 
     def check_step(self, dt: float, divides: bool) -> None:
         given = {name: value for name, (value, _) in self.physical_values().items()}
-        warn_of_steps("Motility", given, dt)
+        warn_of_means("Motility", given, dt)
         if self.reversals is None or self.reversal_factor is not None:
             return
         most = max(float(numbers(x).max()) for x in each_value(self.reversals))

@@ -24,7 +24,7 @@ from torchfilm.effects.bound_rules import MEANING, BoundRules
 from torchfilm.resolver import Values
 from torchfilm.rule_values import near_name
 from torchfilm.rule_views import OF_EFFECTS, CellsView, DivisionView
-from torchfilm.signals.schedule import warn_of_steps
+from torchfilm.signals.schedule import warn_of_means
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.code_names import names_in
@@ -132,7 +132,7 @@ class Rules(Effect):
             )
 
     def check_step(self, dt: float, divides: bool) -> None:
-        warn_of_steps("Rules", self.parameters, dt)
+        warn_of_means("Rules", self.parameters, dt)
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return tuple(Field(name, MEANING, initial=value) for name, value in self.variables.items())

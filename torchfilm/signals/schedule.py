@@ -30,11 +30,11 @@ class Schedule(metaclass=checks.KnownKeywords):
     place of the schedule. period: hours after which the values begin again, and before 0 h end;
     None: the last value stays, and the first holds before 0 h, too.
 
-    A medium takes one in place of a source, a flow, a reservoir or the value at a face, with the
-    value that holds as a step begins. A circuit takes one as a constant: `p.light` of
-    `Circuit(…, light=schedule)` has the value of the middle of a step. In `Lysis`, and in rules as
-    `schedule(cells.time)`, it is that of its beginning; with a dead time, `schedule(cells.time −
-    delay)`.
+    Circuits, rules and `MediumReactions` take one as a constant, `p.light` of `Circuit(…,
+    light=schedule)`, and so do `Lysis`, `Erosion` and `Motility`: each step has the mean of what
+    holds during it, so that doses are exact whenever they begin and end. A medium takes one in
+    place of a source, a flow, a reservoir or the value at a face, with the value that holds as a
+    step begins. `schedule(time)` is the value at a time, `schedule.mean(begin, end)` the mean.
     """
 
     values: Mapping[float, Any]
@@ -91,10 +91,75 @@ class Schedule(metaclass=checks.KnownKeywords):
             " p.light."
         )
 
-    def warn_of_step(self, what: str, dt: float, late: float = 0.0) -> None:
-        """Warn where steps of dt hours, each with the value that holds `late` of a step after its
-        beginning, do not follow the changes of `what`."""
-        if lost := self._lost(dt, late):
+    def shares(self, begin: float, end: float) -> list[tuple[int, float]]:
+        """Which of the values hold from one time to another, h, each with its share of that time;
+        the shares are together 1."""
+        hours, found = end - begin, dict.fromkeys(range(len(self.times)), 0.0)
+        edge = end - ROUNDING * max(1.0, abs(end))
+        if self.period is not None and hours > self.period:
+            whole = math.floor(hours / self.period)
+            for k, length in enumerate(self._lengths):
+                found[k] += whole * length
+            begin += whole * self.period
+        while begin < edge:
+            k = self.place(begin)
+            upto = min(self._next(begin, k), end)
+            found[k] += (end if upto >= edge else upto) - begin
+            begin = upto
+        if not (held := [(k, x) for k, x in found.items() if x > 0]):
+            return [(self.place(begin), 1.0)]
+        return [(k, x / hours) for k, x in held] if len(held) > 1 else [(held[0][0], 1.0)]
+
+    @property
+    def _lengths(self) -> list[float]:
+        """How long each value holds, h; the last one until the period ends, or for ever."""
+        ends = (*self.times[1:], math.inf if self.period is None else self.period)
+        return [end - begin for begin, end in zip(self.times, ends, strict=True)]
+
+    def _next(self, time: float, place: int) -> float:
+        """When the next value begins after a time at which that of a place holds, h."""
+        if self.period is None:
+            return self.times[place + 1] if place + 1 < len(self.times) else math.inf
+        after = time + ROUNDING * max(1.0, abs(time))
+        ends = (*self.times[1:], self.period)
+        return after - after % self.period + ends[place]
+
+    def mean(self, begin: float, end: float) -> Any:
+        """The mean of its numbers, or tensors, from one time to another, h, as a step from `begin`
+        to `end` has it in a circuit. Raises InputError for an end that is not later."""
+        begin = checks.number("Schedule.mean(begin)", begin)
+        end = checks.number("Schedule.mean(end)", end, above=begin)
+        held = list(self.values.values())
+        shares = self.shares(begin, end)
+        if len(shares) == 1:
+            return held[shares[0][0]]
+        return sum(share * held[k] for k, share in shares)
+
+    def warn_of_mean(self, what: str, dt: float) -> None:
+        """Warn where a value of `what` holds for less than a step of dt hours, and so never in a
+        whole one."""
+        for k, (time, length) in enumerate(zip(self.times, self._lengths, strict=True)):
+            if length < dt * (1 - 1e-6) and not self._between(k):
+                warn(
+                    f"{what} has the value of {time:g} h for {length:.3g} h, less than a step of"
+                    f" {dt:g} h. Steps take the mean over their time: the dose is right, but what"
+                    " does not answer in proportion sees another input. Take a shorter dt."
+                )
+                return
+
+    def _between(self, place: int) -> bool:
+        """Whether a value is a number between those before and after it, as of a ramp."""
+        held = [*self.values.values()]
+        beside = held[max(place - 1, 0)], held[min(place + 1, len(held) - 1)]
+        if self.period is not None:
+            beside = held[place - 1], held[(place + 1) % len(held)]
+        numbers = [x for x in (*beside, held[place]) if isinstance(x, Real)]
+        return len(numbers) == 3 and min(beside) <= held[place] <= max(beside)
+
+    def warn_of_step(self, what: str, dt: float) -> None:
+        """Warn where steps of dt hours, each with the value that holds as it begins, do not follow
+        the changes of `what`."""
+        if lost := self._lost(dt):
             warn(
                 f"{what} has the value of {', '.join(f'{t:g} h' for t in lost)} in no step of"
                 f" {dt:g} h: it is lost. Take a shorter dt, of which the times are multiples."
@@ -109,12 +174,12 @@ class Schedule(metaclass=checks.KnownKeywords):
                 " times, and the period, be multiples of dt."
             )
 
-    def _lost(self, dt: float, late: float) -> list[float]:
+    def _lost(self, dt: float) -> list[float]:
         """The times whose values no step of the first period takes, or of as long as it changes."""
         end = self.times[-1] + 2 * dt if self.period is None else self.period
-        steps = int(end / dt - late + ROUNDING) + 1
+        steps = int(end / dt + ROUNDING) + 1
         if steps < len(self.times) or steps < MOST_LOOKED_AT:
-            seen = {self.place((k + late) * dt) for k in range(steps)}
+            seen = {self.place(k * dt) for k in range(steps)}
             return [t for k, t in enumerate(self.times) if k not in seen]
         return []
 
@@ -126,11 +191,11 @@ class Schedule(metaclass=checks.KnownKeywords):
         return f"changes at {times} h{again}" if times else "stays as it is"
 
 
-def warn_of_steps(owner: str, values: Mapping[str, Any], dt: float, late: float = 0.0) -> None:
-    """Warn as `Schedule.warn_of_step` of those values of an effect, by name, that are schedules."""
+def warn_of_means(owner: str, values: Mapping[str, Any], dt: float) -> None:
+    """Warn as `Schedule.warn_of_mean` of those values of an effect, by name, that are schedules."""
     for name, value in values.items():
         if isinstance(value, Schedule):
-            value.warn_of_step(f"{owner}.{name}", dt, late)
+            value.warn_of_mean(f"{owner}.{name}", dt)
 
 
 def each_value(given: Any) -> tuple[Any, ...]:
