@@ -20,7 +20,7 @@ from design.posterior import Posterior
 from design.prior import Prior
 from design.progress import advance, open_bar
 from design.region import Region
-from design.simulations import Simulations, simulate_designs
+from design.simulations import Simulations, keep_learnt, simulate_designs
 from design.targets.conditions import Conditions
 from design.targets.measured import Measured
 from design.targets.observed import Observed
@@ -78,11 +78,11 @@ def infer(
     when the data were observed. replicates: with fewer than were observed, the posterior is wider
     than the data allow. prior: what is known before, by the names of parameters: for a number a
     frozen distribution of scipy.stats, for a choice the share of each option (`Prior`). path: a
-    file that keeps the simulations; running the same again takes them from it, also for other data
-    of the same statistics. samples: of the posterior. flows, epochs: of the estimator; more flows
-    are less sure. executor: of the `concurrent.futures` kind, for other processes. progress: as for
-    `Search.run`. Raises the errors of `Task`, and InputError where sbi is missing (the `infer`
-    extra), for the file of other simulations, and where fewer than 50 simulations succeed.
+    file that keeps the simulations, also for other data of the same statistics, and what was
+    learnt: the same again, in another process too, takes seconds. samples: of the posterior. flows,
+    epochs: of the estimator; more are less sure. executor: of `concurrent.futures`. progress: as
+    for `Search.run`. Raises the errors of `Task`, and InputError where sbi is missing (the `infer`
+    extra), for the file of other simulations, and where fewer than 50 succeed.
     """
     require_sbi()
     data = checked_data(observed)
@@ -161,7 +161,7 @@ class _Estimation:
             learnt = NeuralPosterior.learn(
                 found.points[rows], found.statistics[rows], unit=np.array(self.unit), region=region,
                 levels=self.levels, seed=self.seed, flows=self.flows, epochs=self.epochs,
-                begun=begun,
+                begun=begun, kept=found.learnt,
             )  # fmt: skip
             advance(bar, 1)
         return learnt
@@ -191,6 +191,7 @@ def _in_rounds(
             regions = found.regions[: len(regions) + 1]
             continue
         learnt = estimation.learn(found, regions[-1])
+        keep_learnt(task, prior, plan, path, found.learnt)
         if len(regions) == rounds:
             return found, learnt
         drawn = learnt.sample(np.array([data.values]), DRAWN, seed=estimation.seed)[0]

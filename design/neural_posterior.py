@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
+from importlib.metadata import version
 from importlib.util import find_spec
 from typing import Any
 
@@ -16,10 +17,12 @@ import torch
 from torch import Tensor, nn
 
 import torchfilm as tf
+from design.learnt import LearntNetworks
 from design.options import Classifier, Options
 from design.quiet import ALONE, alone_and_quiet
 from design.region import Region
 
+FORM = "maf"  # of flows, as sbi calls it: masked autoregressive
 EDGE = 1e-6  # coordinates this close to a bound count as so close
 FARTHEST = 10.0  # standard deviations: statistics farther off count as so far
 CONSTANT = 1e-9  # a standard deviation, relative to the mean, from which a statistic varies
@@ -153,6 +156,7 @@ class NeuralPosterior:
         flows: int,
         epochs: int,
         begun: Callable[[int], None] = lambda _: None,
+        kept: LearntNetworks | None = None,
     ) -> NeuralPosterior:
         """Learn from simulations: points (n, D) within the region, by default all in [0, 1],
         statistics (n, K), all finite. unit: of each statistic, about its error. levels: the
@@ -164,7 +168,8 @@ class NeuralPosterior:
         20 passes after the loss on a tenth of the data has ceased to fall. One flow in ten ends in
         a poor optimum, as wide as the bounds; it is learnt again, and left out if it stays so. It
         warns where all are poor. begun: called with the number of each flow, from 0, before it is
-        learnt. Needs sbi (the `infer` extra). The state of torch's random numbers is kept.
+        learnt. kept: networks that need not be learnt again; those learnt now are added. Needs sbi
+        (the `infer` extra). The state of torch's random numbers is kept.
         """
         require_sbi()
         unit = np.where(statistics.std(0) > WIDE * np.asarray(unit), unit, np.inf)
@@ -185,20 +190,22 @@ class NeuralPosterior:
         x = _scaled(torch.as_tensor(seen[:, used]), centre, scale)
         classes = torch.as_tensor(options.of_points(points))
         theta = _logit(torch.as_tensor(region.widen(points)[:, rest]))
+        kept = LearntNetworks() if kept is None else kept
         with ALONE, torch.random.fork_rng(devices=[]):
             classifier: Classifier | None = None
             learnt: tuple[Flow, ...] = ()
             if options.places:
                 classifier = Classifier.learn(
-                    x, classes, options.classes, seed=seed, networks=flows, epochs=epochs
-                )
+                    x, classes, options.classes, seed=seed, networks=flows, epochs=epochs,
+                    kept=kept,
+                )  # fmt: skip
             if rest:
                 given = _with_options(x, classes, options)
                 line, least = Regression.none(theta, given), -math.inf
                 if len(x) >= ENOUGH * given.shape[1]:
                     known = Regression.of(theta, given)
                     line, least = line if region.is_whole else known, known.fit
-                learnt = _learn_flows(theta, given, line, least, seed, flows, epochs, begun)
+                learnt = _learn_flows(theta, given, line, least, seed, flows, epochs, begun, kept)
         return NeuralPosterior(learnt, unit, centre, scale, used, region, options, classifier)
 
     def _inputs(self, statistics: np.ndarray) -> Tensor:
@@ -296,6 +303,19 @@ class _NoTracker:
     def flush(self) -> None: ...
 
 
+def _kept_flow(residuals: Tensor, x: Tensor, seed: int, epochs: int, kept: LearntNetworks) -> Any:
+    """As `_learn_flow`, or as it was kept."""
+
+    def build() -> Any:
+        with alone_and_quiet():
+            from sbi.neural_nets import posterior_nn
+
+            return posterior_nn(model=FORM)(residuals, x)
+
+    about = FORM, version("sbi"), residuals, x, seed, epochs
+    return kept.network(about, build, lambda: _learn_flow(residuals, x, seed, epochs))
+
+
 def _learn_flow(residuals: Tensor, x: Tensor, seed: int, epochs: int) -> Any:
     """One flow, from its own start and division of the data."""
     # sbi warns of its own imports, and prints when it has converged
@@ -303,7 +323,7 @@ def _learn_flow(residuals: Tensor, x: Tensor, seed: int, epochs: int) -> Any:
         from sbi.inference import NPE
 
         torch.manual_seed(seed)
-        learner = NPE(density_estimator="maf", show_progress_bars=False, tracker=_NoTracker())
+        learner = NPE(density_estimator=FORM, show_progress_bars=False, tracker=_NoTracker())
         learner.append_simulations(residuals, x)
         batch = min(200, max(2, len(residuals) // 10))
         return learner.train(training_batch_size=batch, max_num_epochs=epochs).eval()
@@ -318,6 +338,7 @@ def _learn_flows(
     flows: int,
     epochs: int,
     begun: Callable[[int], None],
+    kept: LearntNetworks,
 ) -> tuple[Flow, ...]:
     """As many flows, without those in poor optima; at least one. line: the regression below each;
     least: the fit of one alone."""
@@ -329,7 +350,8 @@ def _learn_flows(
             if found[k][1] is not None and found[k][0] >= poor:
                 continue
             begun(k)
-            made = Flow(_learn_flow(left, x.float(), seed + attempt * flows + k, epochs), line)
+            own = seed + attempt * flows + k
+            made = Flow(_kept_flow(left, x.float(), own, epochs, kept), line)
             with torch.no_grad():
                 fit = float(made.of_rows(theta, x).mean())
             if found[k][1] is None or fit > found[k][0]:

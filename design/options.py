@@ -6,10 +6,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+
+from design.learnt import LearntNetworks
 
 MOST = 12  # combinations of options that a classifier tells apart
 WIDTH, RATE, DECAY = 32, 5e-3, 1e-4  # of its hidden layers; of learning; of weights
@@ -69,12 +72,17 @@ class Classifier:
 
     @staticmethod
     def learn(
-        x: Tensor, classes: Tensor, count: int, *, seed: int, networks: int, epochs: int
-    ) -> Classifier:
-        """From statistics (n, K) and the class of each, of `count`. The state of torch's random
-        numbers is not kept."""
-        learnt = (_learn(x.float(), classes, count, seed + k, epochs) for k in range(networks))
-        return Classifier(tuple(learnt))
+        x: Tensor, classes: Tensor, count: int, *, seed: int, networks: int, epochs: int,
+        kept: LearntNetworks,
+    ) -> Classifier:  # fmt: skip
+        """From statistics (n, K) and the class of each, of `count`; those that are `kept` are not
+        learnt again. The state of torch's random numbers is not kept."""
+        found, build = [], lambda: _network(x.shape[1], count)
+        for k in range(networks):
+            given = x.float(), classes, count, seed + k, epochs
+            learn = partial(_learn, *given)
+            found.append(kept.network(("classifier", *given), build, learn).requires_grad_(False))
+        return Classifier(tuple(found))
 
     def log_shares(self, x: Tensor) -> Tensor:
         """The logarithm of the share of each class for statistics (m, K), (m, classes)."""
@@ -82,14 +90,18 @@ class Classifier:
         return torch.logsumexp(torch.stack(each), 0) - math.log(len(each))
 
 
+def _network(statistics: int, classes: int) -> nn.Module:
+    return nn.Sequential(
+        nn.Linear(statistics, WIDTH), nn.Tanh(), nn.Linear(WIDTH, WIDTH), nn.Tanh(),
+        nn.Linear(WIDTH, classes),
+    )  # fmt: skip
+
+
 @torch.enable_grad()
 def _learn(x: Tensor, classes: Tensor, count: int, seed: int, epochs: int) -> nn.Module:
     """A network with the lowest loss on the simulations that are held back."""
     torch.manual_seed(seed)
-    network = nn.Sequential(
-        nn.Linear(x.shape[1], WIDTH), nn.Tanh(), nn.Linear(WIDTH, WIDTH), nn.Tanh(),
-        nn.Linear(WIDTH, count),
-    )  # fmt: skip
+    network = _network(x.shape[1], count)
     order = torch.randperm(len(x))
     held, rest = order.split([max(1, int(HELD * len(x))), len(x) - max(1, int(HELD * len(x)))])
     optimiser = torch.optim.Adam(network.parameters(), RATE, weight_decay=DECAY)
@@ -108,4 +120,4 @@ def _learn(x: Tensor, classes: Tensor, count: int, seed: int, epochs: int) -> nn
         if since > PATIENCE:
             break
     network.load_state_dict(kept)
-    return network.eval().requires_grad_(False)
+    return network.eval()

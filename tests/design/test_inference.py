@@ -348,7 +348,7 @@ def test_an_estimator_that_learns_nothing_is_warned_of(monkeypatch):
                               epochs=5)  # fmt: skip
 
 
-class _Flat:
+class _Flat(torch.nn.Module):
     """A wide normal density, whatever the statistics."""
 
     def log_prob(self, theta, condition):
