@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
+from torch import Tensor
 
 HALVINGS = 90  # of the bracket of length/radius; to the last digits of a float64
 
 
-def moments_of_capsule(
-    length: np.ndarray, radius: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+Numbers = TypeVar("Numbers", np.ndarray, Tensor)
+
+
+def moments_of_capsule(length: Numbers, radius: Numbers) -> tuple[Numbers, Numbers, Numbers]:
     """The area of capsules in the plane, and their second central moments per area, along the axis
     and across it; (N,) each.
 
@@ -42,15 +45,15 @@ def capsule_of_moments(along: np.ndarray, across: np.ndarray) -> tuple[np.ndarra
 
 
 # for radius 1: the area, and the integrals of the squared distances from the centre
-def _area(t: np.ndarray) -> np.ndarray:
+def _area(t: Numbers) -> Numbers:
     return 2 * t + math.pi
 
 
-def _along(t: np.ndarray) -> np.ndarray:
+def _along(t: Numbers) -> Numbers:
     return t**3 / 6 + math.pi * t**2 / 4 + 4 * t / 3 + math.pi / 4
 
 
-def _across(t: np.ndarray) -> np.ndarray:
+def _across(t: Numbers) -> Numbers:
     return 2 * t / 3 + math.pi / 4
 
 

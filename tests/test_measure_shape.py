@@ -1,0 +1,142 @@
+"""Shape of colonies, and quantities between neighbours."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import ConvexHull
+
+import torchfilm as tf
+
+
+def state_of(position, axis=(1.0, 0.0), **columns) -> tf.State:
+    cells = tf.Cells(position, axis, **columns)
+    return (
+        tf.Scene(tf.Growth(rate=1.0), founders=cells, dim=cells.dim)
+        .bind(dtype=torch.float64)
+        .start()
+    )
+
+
+def pixels(state: tf.State, size: float) -> np.ndarray:
+    """The places, (M, 2), of the pixels that lie in cells, so wide."""
+    half = 0.5 * state.length[:, None] * state.axis
+    low, high = state.position.min() - 4.0, state.position.max() + 4.0
+    line = torch.arange(float(low), float(high), size, dtype=torch.float64)
+    grid = torch.cartesian_prod(line, line)
+    covered = torch.zeros(len(grid), dtype=torch.bool)
+    for place, arm, radius in zip(state.position, half, state.radius, strict=True):
+        apart = grid - place
+        along = ((apart @ arm) / (arm @ arm).clamp(min=1e-30)).clamp(-1.0, 1.0)
+        covered |= (apart - along[:, None] * arm).norm(dim=1) <= radius
+    return grid[covered].numpy()
+
+
+ROD = [[0.0, 0.0]]
+THREE = [[0.0, 0.0], [5.0, 1.0], [2.0, 4.0]]
+AXES = [[1.0, 0.0], [0.6, 0.8], [0.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("position", "axis", "length"),
+    [(ROD, (0.6, 0.8), 3.0), (THREE, AXES, [2.0, 3.0, 1.0]), ([[1.0, 1.0]], (1.0, 0.0), 0.0)],
+)
+def test_aspect_ratio_and_hull_are_those_of_an_image(position, axis, length):
+    state = state_of(position, axis, length=length)
+    seen = pixels(state, 0.02)
+    variances = np.linalg.eigvalsh(np.cov(seen.T))
+    expected = math.sqrt(variances[1] / variances[0])
+    assert float(tf.measure.aspect_ratio(state)) == pytest.approx(expected, rel=5e-3)
+    # the outermost pixels' middles lie up to a pixel within
+    hull, found = ConvexHull(seen), tf.measure.hull(state)
+    assert float(found.area) == pytest.approx(hull.volume, rel=2e-2)
+    assert float(found.perimeter) == pytest.approx(hull.area, rel=2e-2)
+    assert float(found.solidity) == pytest.approx(len(seen) * 0.02**2 / hull.volume, rel=2e-2)
+    circular = 4 * math.pi * hull.volume / hull.area**2
+    assert float(found.circularity) == pytest.approx(circular, rel=2e-2)
+
+
+def test_a_rod_has_the_hull_of_a_stadium():
+    found = tf.measure.hull(state_of([[3.0, -2.0]], (0.6, 0.8), length=3.0, radius=0.5))
+    assert float(found.area) == pytest.approx(3.0 + math.pi / 4, rel=1e-12)
+    assert float(found.perimeter) == pytest.approx(6.0 + math.pi, rel=1e-12)
+    assert float(found.solidity) == pytest.approx(1.0, rel=1e-12)
+
+
+def test_cells_of_different_width_have_the_hull_of_their_discs():
+    """Two discs of radius 1 and 2, 6 µm apart: a belt around two pulleys."""
+    state = state_of([[0.0, 0.0], [6.0, 0.0]], length=0.0, radius=[1.0, 2.0])
+    angle = math.asin(1.0 / 6.0)
+    straight = 6.0 * math.cos(angle)
+    found = tf.measure.hull(state)
+    belt = 2 * straight + 2.0 * (math.pi + 2 * angle) + (math.pi - 2 * angle)
+    area = straight * (1.0 + 2.0) + 2.0 * (math.pi + 2 * angle) + 0.5 * (math.pi - 2 * angle)
+    assert float(found.perimeter) == pytest.approx(belt, rel=1e-3)
+    assert float(found.area) == pytest.approx(area, rel=1e-3)
+
+
+def test_colonies_stand_for_themselves_and_empty_ones_are_nan():
+    cells = tf.Cells(
+        [*THREE, [0.0, 0.0]], [*AXES, [1.0, 0.0]], [2.0, 3.0, 1.0, 2.0], colony=[0, 0, 0, 2]
+    )
+    scene = tf.Scene(tf.Growth(rate=1.0), founders=cells, dim=2)
+    state = scene.bind(dtype=torch.float64).start()
+    alone = state_of(THREE, AXES, length=[2.0, 3.0, 1.0])
+    aspect, hull = tf.measure.aspect_ratio(state), tf.measure.hull(state)
+    assert aspect[0] == tf.measure.aspect_ratio(alone)[0] and aspect[1].isnan()
+    assert hull.area[0] == tf.measure.hull(alone).area[0] and hull.circularity[1].isnan()
+    assert float(aspect[2]) > 2.0 and float(hull.solidity[2]) == pytest.approx(1.0)
+
+
+def test_in_space_it_is_what_is_seen_from_above():
+    flat = state_of([[0.0, 0.0]], (0.6, 0.8), length=1.5)
+    tilted = state_of([[0.0, 0.0, 4.0]], (0.36, 0.48, 0.8), length=2.5)
+    upright = state_of([[0.0, 0.0, 4.0]], (0.0, 0.0, 1.0), length=2.5)
+    for measure in (tf.measure.aspect_ratio, lambda s: tf.measure.hull(s).area):
+        assert float(measure(tilted)) == pytest.approx(float(measure(flat)), rel=1e-9)
+    assert float(tf.measure.aspect_ratio(upright)) == pytest.approx(1.0)
+    assert float(tf.measure.hull(upright).circularity) == pytest.approx(1.0)
+
+
+def test_aspect_ratios_pass_derivatives():
+    state = state_of(THREE, AXES, length=[2.0, 3.0, 1.0])
+
+    def ratio(x):
+        return tf.measure.aspect_ratio(state.replace(position=x))
+
+    place = state.position.clone().requires_grad_()
+    assert torch.autograd.gradcheck(ratio, place)
+
+
+def test_morans_index():
+    """A line of six touching cells: pairs of neighbours (0, 1), …, (4, 5)."""
+    place = [[3.0 * k, 0.0] for k in range(6)]
+    value = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    state = state_of(place, length=2.0, extra={"lit": value})
+    apart = value - value.mean()
+    expected = (apart[:-1] * apart[1:]).mean() / apart.var()
+    assert float(tf.measure.moran(state, "lit", 0.1)) == pytest.approx(expected)
+    checker = torch.tensor([1.0, -1.0] * 3, dtype=torch.float64)
+    assert float(tf.measure.moran(state, checker, 0.1)) == pytest.approx(-1.0)
+    assert tf.measure.moran(state, torch.ones(6), 0.1).isnan()
+    assert tf.measure.moran(state_of([[0.0, 0.0], [30.0, 0.0]]), "length", 0.1).isnan()
+    with pytest.raises(tf.InputError, match=r"moran\(name\) = 'dark'"):
+        tf.measure.moran(state, "dark", 0.1)
+
+
+def test_morans_index_of_shuffled_cells_is_about_zero():
+    cells = tf.inoculum(300, 30.0, seed=1)
+    state = tf.Scene(tf.Growth(rate=1.0), founders=cells, dim=2).bind().start()
+    drawn = torch.from_numpy(np.random.default_rng(0).normal(size=(40, 300)))
+    found = torch.stack([tf.measure.moran(state, x, 1.0)[0] for x in drawn])
+    assert abs(float(found.mean()) + 1 / 299) < 4 * float(found.std()) / 40**0.5
+
+
+def test_a_periodic_space_has_no_hull():
+    faces = {"x": (-20.0, 20.0)}
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, periodic=faces))
+    with pytest.raises(tf.InputError, match="hull goes by places"):
+        tf.measure.hull(scene.bind().start())
