@@ -44,19 +44,20 @@ class Lineage:
     as a tree.
 
     colony: id of its colony · cell: its uid, unique within the colony · parent: uid, −1 for
-    founders · sister: uid of the other daughter of its mother, −1 where the file has none ·
-    generation: divisions since the first of its line in the file · pole_age: divisions since the
-    older of its poles was formed, as far as the file goes back (−1 of movies, which do not tell
-    it): 1 is the least of a daughter, and the mother of a dead-end channel has her generation ·
-    born: h; the founders' is the start of the run, and that of cells which a run found in the
-    middle of another is not known, NaN · ended: h, NaN while it lives · fate: "alive", "divided",
-    "removed", "left", "lysed", "eroded", "sloughed" or "failed", of a movie also "lost" ·
-    birth_length, end_length: of the centreline, µm, when it was born and ended; NaN where that hour
-    is NaN, and in files of earlier versions but for founders · cell_type: when it ended, or in the
-    last frame while it lives; −1 in a scene without types, and of ends in files of earlier versions
-    · founder: uid of the first of its line in the file. first_seen, last_seen: h, of
-    its first and last frame, of a run when it was born and ended. interval: h, between the frames
-    of a movie; 0 of a run, whose births and ends are noted at every step.
+    founders and cells that came from outside · sister: uid of the other daughter of its mother, −1
+    where the file has none · generation: divisions since the first of its line in the file ·
+    pole_age: divisions since the older of its poles was formed, as far as the file goes back (−1 of
+    movies, which do not tell it): 1 is the least of a daughter, and the mother of a dead-end
+    channel has her generation · born: h; the founders' is the start of the run, of cells from
+    outside when they came, and that of cells which a run found in the middle of another is not
+    known, NaN · ended: h, NaN while it lives · fate: "alive", "divided", "removed", "left",
+    "lysed", "eroded", "sloughed" or "failed", of a movie also "lost" · birth_length, end_length: of
+    the centreline, µm, when it was born and ended; NaN where that hour is NaN, and in files of
+    earlier versions but for founders · cell_type: when it ended, or in the last frame while it
+    lives; −1 in a scene without types, and of ends in files of earlier versions · founder: uid of
+    the first of its line in the file. first_seen, last_seen: h, of its first and last frame, of a
+    run when it was born and ended. interval: h, between the frames of a movie; 0 of a run, whose
+    births and ends are noted at every step.
 
     Cells are named by uid, and in a run of several colonies by `colony`, an id, too. `course` reads
     the file, which must be open. Raises InputError for cells and colonies that it does not have.

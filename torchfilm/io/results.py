@@ -259,7 +259,7 @@ class Results(metaclass=checks.KnownKeywords):
     def table(self, frame: int | None = None, *, internals: bool = False) -> dict[str, np.ndarray]:
         """One row per cell, one column per quantity: of one frame, or of all.
 
-        frame · time, h · colony, its id · cell, unique within the colony · parent, −1 for founders
+        frame · time, h · colony, its id · cell, unique within the colony · parent, or −1
         · x, y, z, µm · angle, rad, of the axis in the plane, and in space tilt, rad, above it ·
         length, of the centreline, and radius, µm · volume, µm³ · age and born, h, as in `Lineage` ·
         the fields of cells and colonies, such as species · out.NAME, each signal at the cell · the
