@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
@@ -161,7 +161,7 @@ class Schedule(metaclass=checks.KnownKeywords):
         the changes of `what`."""
         if lost := self._lost(dt):
             warn(
-                f"{what} has the value of {', '.join(f'{t:g} h' for t in lost)} in no step of"
+                f"{what} has the value of {_listed(lost)} h in no step of"
                 f" {dt:g} h: it is lost. Take a shorter dt, of which the times are multiples."
             )
             return
@@ -169,8 +169,8 @@ class Schedule(metaclass=checks.KnownKeywords):
         between = [t for t in moments if abs(t / dt - round(t / dt)) > 1e-6]
         if between:
             warn(
-                f"{what} changes at {between[0]:g} h, within a step of {dt:g} h. A step takes one"
-                " value, so that values hold for longer or shorter than they should. Let the"
+                f"{what} changes at {_listed(between)} h, within a step of {dt:g} h. A step takes"
+                " one value, so that values hold for longer or shorter than they should. Let the"
                 " times, and the period, be multiples of dt."
             )
 
@@ -189,6 +189,11 @@ class Schedule(metaclass=checks.KnownKeywords):
         times = ", ".join(f"{t:g}" for t in self.times[1:])
         again = "" if self.period is None else f" and every {self.period:g} h anew"
         return f"changes at {times} h{again}" if times else "stays as it is"
+
+
+def _listed(times: Sequence[float]) -> str:
+    """Some times, the first of many."""
+    return ", ".join(f"{t:g}" for t in times[:6]) + (", …" if len(times) > 6 else "")
 
 
 def warn_of_means(owner: str, values: Mapping[str, Any], dt: float) -> None:
