@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 import torchfilm as tf
+from design.learnt import LearntNetworks
 from design.neural_posterior import NeuralPosterior, require_sbi
 from design.options import Options
 from design.parameters import Choice, Parameter, Space
@@ -20,7 +21,7 @@ from design.posterior import Posterior
 from design.prior import Prior
 from design.progress import advance, open_bar
 from design.region import Region
-from design.simulations import Simulations, keep_learnt, simulate_designs
+from design.simulations import Simulations, simulate_designs
 from design.targets.conditions import Conditions
 from design.targets.measured import Measured
 from design.targets.observed import Observed
@@ -69,19 +70,18 @@ def infer(
     rounds: with more than 1, the simulations of each further round lie where those before leave the
     parameters, with a margin, so that few give narrow intervals; the posterior is then for these
     data alone. Each round learns from all simulations within its region (truncation: Miller et al.,
-    arXiv 2107.01214; Deistler et al., arXiv 2210.04815).
-    observed: the data; or measures of your own, `Measured`, whose spreads are the standard errors
-    of the wanted values; or `Conditions` of the data of each condition, such as a dose response:
-    each replicate is then a colony under each condition, with random numbers of its own.
+    arXiv 2107.01214; Deistler et al., arXiv 2210.04815). observed: the data; or measures of your
+    own, `Measured`, whose spreads are the standard errors of the wanted values; or `Conditions` of
+    the data of each condition, such as a dose response: a replicate is a colony under each.
 
     scene, parameters, cells, fixed, seed, dt, dtype, device: as for `Search`. until: h, by default
     when the data were observed. replicates: with fewer than were observed, the posterior is wider
     than the data allow. prior: what is known before, by the names of parameters: for a number a
     frozen distribution of scipy.stats, for a choice the share of each option (`Prior`). path: a
-    file that keeps the simulations, also for other data of the same statistics, and what was
-    learnt: the same again, in another process too, takes seconds. samples: of the posterior. flows,
-    epochs: of the estimator; more are less sure. executor: of `concurrent.futures`. progress: as
-    for `Search.run`. Raises the errors of `Task`, and InputError where sbi is missing (the `infer`
+    file that keeps the simulations, also for other data of the same statistics; what is learnt is
+    kept beside it, and the same again takes seconds. samples: of the posterior. flows, epochs: of
+    the estimator; more are less sure. executor: of `concurrent.futures`. progress: as for
+    `Search.run`. Raises the errors of `Task`, and InputError where sbi is missing (the `infer`
     extra), for the file of other simulations, and where fewer than 50 succeed.
     """
     require_sbi()
@@ -95,7 +95,8 @@ def infer(
         fixed=fixed, seed=seed, dt=dt, dtype=dtype, device=device, replay=False,
     )  # fmt: skip
     known = Prior(task.space, prior)
-    estimation = _Estimation(seed, flows, epochs, progress, data.spread, _options_in(task.space))
+    levels, learnt = _options_in(task.space), LearntNetworks.beside(kept)
+    estimation = _Estimation(seed, flows, epochs, progress, data.spread, levels, learnt)
     found, estimator = _in_rounds(
         task, known, data, simulations, rounds, kept, executor, estimation
     )
@@ -147,6 +148,7 @@ class _Estimation:
     progress: bool | None
     unit: Sequence[float]
     levels: list[int | None]
+    kept: LearntNetworks
 
     def learn(self, found: Simulations, region: Region) -> NeuralPosterior:
         """The density of the parameters, given statistics, within a region."""
@@ -161,9 +163,10 @@ class _Estimation:
             learnt = NeuralPosterior.learn(
                 found.points[rows], found.statistics[rows], unit=np.array(self.unit), region=region,
                 levels=self.levels, seed=self.seed, flows=self.flows, epochs=self.epochs,
-                begun=begun, kept=found.learnt,
+                begun=begun, kept=self.kept,
             )  # fmt: skip
             advance(bar, 1)
+        self.kept.write()
         return learnt
 
 
@@ -191,7 +194,6 @@ def _in_rounds(
             regions = found.regions[: len(regions) + 1]
             continue
         learnt = estimation.learn(found, regions[-1])
-        keep_learnt(task, prior, plan, path, found.learnt)
         if len(regions) == rounds:
             return found, learnt
         drawn = learnt.sample(np.array([data.values]), DRAWN, seed=estimation.seed)[0]

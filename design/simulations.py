@@ -20,7 +20,6 @@ from design import colonies
 from design.data_file import Stamp, reading, replacing, stamp, write_values
 from design.executors import check_executor
 from design.growing import FailedColony, grow
-from design.learnt import LearntNetworks
 from design.parameters import Value
 from design.prior import Prior
 from design.reasons import tally
@@ -43,7 +42,6 @@ class Simulations:
     points: coordinates of the parameters, (n, D) in [0, 1]; statistics: (n, K), means
     over the colonies of each, NaN where one of them failed. cells: (n,) of each, the mean of its
     colonies. reasons: of failures, by row. regions: of the rounds of inference that have begun.
-    learnt: what was learnt from them.
     """
 
     points: np.ndarray
@@ -51,7 +49,6 @@ class Simulations:
     cells: np.ndarray
     reasons: dict[int, str] = field(default_factory=dict)
     regions: tuple[Region, ...] = ()
-    learnt: LearntNetworks = field(default_factory=LearntNetworks)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -66,7 +63,7 @@ class Simulations:
         start, stop, _ = rows.indices(len(self))
         reasons = {k - start: words for k, words in self.reasons.items() if start <= k < stop}
         arrays = self.points[rows], self.statistics[rows], self.cells[rows]
-        return Simulations(*arrays, reasons, self.regions, self.learnt)
+        return Simulations(*arrays, reasons, self.regions)
 
     def within(self, region: Region) -> np.ndarray:
         """Those that did not fail and lie within a region, (n,) bool."""
@@ -80,7 +77,6 @@ class Simulations:
             np.concatenate([self.cells, other.cells]),
             self.reasons | moved,
             self.regions,
-            self.learnt,
         )
 
     def failures(self) -> list[tuple[str, int]]:
@@ -147,20 +143,6 @@ def simulate_designs(
         before = _write(path, task, kept, known, before)
         seen(len(known))
     return known.take(slice(0, count))
-
-
-def keep_learnt(
-    task: Task, prior: Prior, rounds: tuple[int, int] | None, path: Path | None,
-    learnt: LearntNetworks,
-) -> None:  # fmt: skip
-    """Write networks into the file from whose simulations they were learnt."""
-    if path is None or not learnt.new:
-        return
-    before, kept = stamp(path), about(task, prior, rounds)
-    known = _read(path, task, kept)
-    known.learnt.known.update(learnt.known)
-    _write(path, task, kept, known, before)
-    learnt.new = 0
 
 
 def simulate_points(task: Task, points: np.ndarray, first: int) -> Simulations:
@@ -284,7 +266,6 @@ def _write(
         file.create_dataset("names", data=names, dtype=h5py.string_dtype())
         for name, column in shown_values(task, known.points).items():
             write_values(file, name, column)
-        known.learnt.write(file)
         file.attrs["reasons"] = json.dumps(known.reasons)
         mark = str(file.attrs["written"])
     return mark
@@ -310,8 +291,7 @@ def _read(path: Path | None, task: Task, wanted: Mapping[str, Any]) -> Simulatio
                 Region(ends[0], ends[1], start)
                 for ends, start in zip(file["regions"][...], starts, strict=True)
             )
-        statistics, learnt = file["statistics"][...], LearntNetworks.read(file)
-        found = Simulations(points, statistics, cells, reasons, regions, learnt)
+        found = Simulations(points, file["statistics"][...], cells, reasons, regions)
         kept["statistics"] = [n.decode() for n in file["names"][...]]
     mine["statistics"] = list(names)
     plain = json.loads(json.dumps(mine))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from torch import nn
 
 import torchfilm as tf
-from design import Choice, Measured, Parameter, infer, neural_posterior, options
+from design import Choice, Measured, Parameter, data_file, infer, neural_posterior, options
 from design.learnt import LearntNetworks
 
 needs_sbi = pytest.mark.skipif(find_spec("sbi") is None, reason='needs pip install -e ".[infer]"')
@@ -60,31 +61,56 @@ def test_nothing_is_learnt_twice(tmp_path, monkeypatch, rounds):
 
 
 @needs_sbi
-def test_more_simulations_and_what_was_learnt_stay(tmp_path):
-    path = tmp_path / "kept.h5"
+def test_other_networks_are_added(tmp_path):
+    path, beside = tmp_path / "kept.h5", tmp_path / "kept.networks.h5"
     found(path=path, simulations=120)
-    with h5py.File(path) as file:
-        points, words = file["points"][...], set(file["networks"])
-    assert len(points) == 120 and len(words) == 2 * 2  # a classifier and a flow, twice
+    with h5py.File(beside) as file:
+        words = set(file["networks"])
+    assert len(words) == 2 * 2  # a classifier and a flow, twice
     found(path=path)
-    with h5py.File(path) as file:
-        assert np.array_equal(file["points"][...], points)
+    with h5py.File(beside) as file:
         assert set(file["networks"]) > words and len(file["networks"]) == 8
+    with h5py.File(path) as file:
+        assert len(file["points"]) == 120
+
+
+@needs_sbi
+def test_a_full_disk_costs_no_posterior(tmp_path, monkeypatch):
+    path = tmp_path / "kept.h5"
+    found(path=path)
+    monkeypatch.setattr(data_file.shutil, "disk_usage", lambda path: SimpleNamespace(free=0))
+    with pytest.warns(UserWarning, match=r"what was learnt is not kept: no room to write"):
+        assert len(found(path=path, epochs=5).points) == 300
 
 
 def test_a_network_is_kept_by_what_it_was_learnt_from(tmp_path):
     def learn() -> nn.Module:
         return nn.Linear(2, 3)
 
-    numbers, kept = np.arange(3.0), LearntNetworks()
-    made = kept.network((numbers, 4), learn, learn)
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        kept.write(file)
-    with h5py.File(tmp_path / "a.h5") as file:
-        again = LearntNetworks.read(file)
+    def kept() -> LearntNetworks:
+        return LearntNetworks.beside(tmp_path / "a.h5")
+
+    numbers, first = np.arange(3.0), kept()
+    made = first.network((numbers, 4), learn, learn)
+    first.write()
+    again = kept()
     same = again.network((numbers, 4), learn, never)
-    assert torch.equal(same.weight, made.weight) and again.new == 0 and kept.new == 1
-    assert not torch.equal(again.network((numbers, 5), learn, learn).weight, made.weight)
-    assert again.new == 1
-    with pytest.raises(tf.InputError, match=r"is not of this form.*another path"):
-        again.network((numbers, 4), lambda: nn.Linear(2, 4), never)
+    assert torch.equal(same.weight, made.weight) and not again.new and not first.new
+    other = again.network((numbers, 5), learn, learn)
+    assert not torch.equal(other.weight, made.weight) and len(again.new) == 1
+    # as if another process had written in between
+    third = kept()
+    third.network((numbers, 6), learn, learn)
+    third.write()
+    again.write()
+    assert len(kept().known) == 3
+    with pytest.warns(UserWarning, match="is damaged, and is learnt again"):
+        changed = again.network((numbers, 4), lambda: nn.Linear(2, 4), lambda: nn.Linear(2, 4))
+    assert changed.weight.shape == (4, 2)
+
+
+def test_networks_without_a_file_are_kept_for_now():
+    learnt = LearntNetworks.beside(None)
+    learnt.network(1, lambda: nn.Linear(1, 1), lambda: nn.Linear(1, 1))
+    learnt.write()
+    assert learnt.network(1, lambda: nn.Linear(1, 1), never).weight.shape == (1, 1)
