@@ -194,6 +194,27 @@ def test_their_numbers_are_kept_with_the_results(tmp_path):
     assert torch.equal(whole.position, end.position)
 
 
+def test_what_colonies_began_with_stays_on_record(tmp_path):
+    first, other = ([0.25, 0.5, x] for x in (0.75, 0.8))
+    of = lambda shares: scene(tf.Founders(shared, share=shares, count=4))
+    for _ in tf.simulate(of(first), until=0.1, record=tmp_path / "a.h5"):
+        pass
+    with tf.Results(tmp_path / "a.h5") as results:
+        state = results.state(of(first))
+    for _ in tf.simulate(
+        of(other), state, until=0.2, record=tf.Recorder(tmp_path / "a.h5", of(other), append=True)
+    ):
+        pass
+    with tf.Results(tmp_path / "a.h5") as results:
+        assert set(results.table()["share"]) == {0.25, 0.5, 0.75}
+    # founders in the place of others
+    model = of(first).bind(cells=shared(0, 0.5))
+    for _ in tf.simulate(model, until=0.1, record=tmp_path / "b.h5"):
+        pass
+    with tf.Results(tmp_path / "b.h5") as results:
+        assert "share" not in results.table()
+
+
 def test_a_search_varies_them():
     """Of cells that grow alike the composition at the end is that of the founders."""
 
@@ -247,6 +268,18 @@ def test_conditions_set_them():
         (
             lambda: scene(tf.Founders(shared, share=[0.5, 0.2])).bind(3),
             "2 values per colony.*one value for each of the 3 colonies",
+        ),
+        (
+            lambda: scene(tf.Founders(shared, share=[0.5, 0.2])).bind(
+                state=scene().bind(3).start()
+            ),
+            "2 values per colony.*one value for each of the 3 colonies",
+        ),
+        (
+            lambda: tf.GrowthRecording(
+                scene(tf.Founders(shared, share=[0.5, 0.2])), streams=range(2)
+            ),
+            "founders differ between colonies",
         ),
         (lambda: tf.inoculum([3, 4], RADIUS), r"count = \[3, 4\] .*tf\.Founders"),
         (lambda: scene(shared), "the seed of the colony.*tf.Founders"),

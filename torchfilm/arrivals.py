@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from torchfilm.initial_cells import Cells
+from torchfilm.initial_cells import GIVEN, Cells
 from torchfilm.state import CELL, PER_CELL, State
 from torchfilm.state_colonies import Arrived
 from torchfilm.tools import checks, row_checks
@@ -23,7 +24,9 @@ def with_arrivals(
 ) -> State:
     """See `Model.add`."""
     model.check(state)
-    _check_cells(cells, state)
+    if state.span is not None:
+        raise checks.InputError("add puts cells into a state between two steps, not within one.")
+    _check_cells(cells, state, typed=model.scene.founders.cell_type is not None)
     places = _places(cells, state, colonies)
     if not places:
         return state
@@ -34,20 +37,23 @@ def with_arrivals(
     alone = made.take(rows)
     for effect in model.effects:
         effect.check(alone)
-    note = Arrived(alone.own_colony_id, alone.uid, alone.length, step=state.step, time=state.time)
+    ids, length = alone.own_colony_id, alone.length.detach()
+    note = Arrived(ids, alone.uid, length, step=state.step, time=state.time)
     return made.replace(arrived=(*state.arrived, note))
 
 
-def _check_cells(cells: Cells, state: State) -> None:
-    """Raise InputError for cells that cannot stand beside those of a state."""
+def _check_cells(cells: Cells, state: State, typed: bool) -> None:
+    """Raise InputError for cells that cannot stand beside those of a state. typed: whether the
+    founders have types."""
     if not isinstance(cells, Cells):
         raise checks.input_error("add(cells)", cells, "a tf.Cells, such as tf.inoculum(…)")
     if cells.dim != state.dim:
         raise checks.input_error("add(cells)", f"{cells.dim}-D", f"{state.dim}-D, as the state is")
-    if ("cell_type" in state.fields) != (cells.cell_type is not None):
-        has, rule = ("without", "with") if cells.cell_type is None else ("with", "without")
+    has = cells.cell_type is not None
+    if (has and "cell_type" not in state.fields) or (typed and not has):
+        given, rule = ("with", "without") if has else ("without", "with")
         raise checks.input_error(
-            "add(cells)", f"{has} cell_type", f"{rule} cell_type, as the cells of the state are"
+            "add(cells)", f"{given} cell_type", f"{rule} cell_type, as the founders are"
         )
     own = [n for n, f in state.declared.items() if f.scope == CELL and not f.internal]
     for name in cells.extra:
@@ -112,9 +118,14 @@ def _beside(state: State, come: State) -> State:
         else x
         for n, x in state.fields.items()
     }
+    place = torch.argsort(order)  # of each cell
+    births = tuple(
+        replace(b, first=place.index_select(0, b.first), second=place.index_select(0, b.second))
+        for b in state.births
+    )
     return state.replace(
         **{n: both(getattr(state, n), getattr(come, n)) for n in PER_CELL},
-        fields=fields, next_uid=state.next_uid + counts, reports={},
+        fields=fields, next_uid=state.next_uid + counts, births=births,
     )  # fmt: skip
 
 
@@ -123,7 +134,7 @@ def _with_first_values(model: Model, state: State, rows: Tensor, come: State) ->
     order in which first cells have them."""
     names = [n for n, f in state.declared.items() if f.scope == CELL and n not in come.fields]
     for name in names:
-        if name not in model.first_fields:
+        if name not in model.first_fields and state.declared[name].meaning == GIVEN:
             raise checks.input_error(
                 "add(cells).extra", [*come.fields], f"with {name!r}, which the founders brought",
                 f"No effect gives it a first value: extra={{{name!r}: …}}.",

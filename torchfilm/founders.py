@@ -82,6 +82,12 @@ class Founders:
             if all(isinstance(one, bool | int | float) for one in x)
         ]
 
+    def check_colonies(self, count: int) -> None:
+        """Raise InputError unless there is a value for each of so many colonies."""
+        if self.colonies not in (None, count):
+            rule = f"one value for each of the {count} colonies of the batch"
+            raise checks.input_error("Founders", f"{self.colonies} values per colony", rule)
+
     def one(self, seed: int, colony: int = 0, like: Cells | None = None) -> Cells:
         """The founders of a colony from a seed. Raises InputError unless they are cells of one
         colony, with the columns of others."""
@@ -139,14 +145,15 @@ class FirstCells:
     scene: Scene
     given: Cells | None
 
+    def __post_init__(self) -> None:
+        if self.scene.draw is not None and self.given is None:
+            self.scene.draw.check_colonies(self.colonies)
+
     @cached_property
     def cells(self) -> Cells:
         draw, given = self.scene.draw, self.given
         if given is not None or draw is None:
             return self.scene.founders if given is None else given
-        if draw.colonies not in (None, self.colonies):
-            rule = f"one value for each of the {self.colonies} colonies of the batch"
-            raise checks.input_error("Founders", f"{draw.colonies} values per colony", rule)
         streams = range(self.colonies) if self.streams is None else self.streams.tolist()
         return draw.of_streams(self.seed, streams, self.scene.founders)
 

@@ -23,6 +23,8 @@ from torchfilm.tools.warn_once import warn
 if TYPE_CHECKING:
     from torchfilm.micrographs.record import Micrograph
 
+GIVEN = "given with the first cells"  # what a field means that they bring
+
 
 @dataclass(frozen=True, repr=False)
 class Cells(metaclass=checks.KnownKeywords):
@@ -170,9 +172,7 @@ class Cells(metaclass=checks.KnownKeywords):
                 cell_type=tensor(self.cell_type, torch.int64)
             )
         for name, values in self.extra.items():
-            state = state.declare(Field(name, "given with the first cells")).with_fields(
-                **{name: tensor(values, dtype)}
-            )
+            state = state.declare(Field(name, GIVEN)).with_fields(**{name: tensor(values, dtype)})
         return state
 
     def overlaps(

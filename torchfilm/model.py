@@ -56,7 +56,7 @@ class Model:
         self, scene: Scene, batch: BoundBatch, start: FirstCells, only: Collection[int] | None
     ):
         self.scene, self.batch, self.dt, self.dim = scene, batch, scene.dt, scene.dim
-        self._begin, self.seed = start, start.seed
+        self._begin, self.seed, self.cells_given = start, start.seed, start.given is not None
         late = any(e.divides_at_threshold for e in scene.effects)
         stage = DIVISION if late else FLAGGED_DIVISION
         binding = Binding(batch, scene.dt, scene.dim, scene.declared_by, stage)
@@ -380,8 +380,8 @@ def bind(
     checks.float_type("dtype", dtype)
     if founders.dim != scene.dim:
         raise checks.input_error("cells", f"{founders.dim}-D", f"{scene.dim}-D, as the scene is")
-    batch = BoundBatch(count, dtype, checks.device(device), _types(founders), per_colony)
     start = FirstCells(count, seed, checked_streams(streams, count), scene, cells)
+    batch = BoundBatch(count, dtype, checks.device(device), _types(start.cells), per_colony)
     model = Model(scene, batch, start, only)
     first = model.trace(None)
     if only is None:  # a part of a scene lacks what the rest of it declares

@@ -285,10 +285,10 @@ class Replay(metaclass=checks.KnownKeywords):
         place = self.order.index_select(0, torch.searchsorted(self.streams, state.stream))
         followed = _Followed(place)
         changes = {change.part: change for change in self.recording.changes(number)}
-        if state.ended or state.arrived:
+        if any(a.step == number for a in state.arrived):
             raise checks.InputError(
-                "cells were removed from the state, or added to it, but growth was recorded with"
-                " those that there were. Step the model itself: replay.model.step(state)."
+                "cells were added to the state, but growth was recorded without them. Step the"
+                " model itself: replay.model.step(state)."
             )
         state = self.model.opened(state, self.dt)
         if FIRST in changes:

@@ -365,13 +365,12 @@ class State:
         off: also without those of columns such as growth_rate, by which derivatives by Growth.rate
         go on."""
         cut = self.moved(lambda part: part.detach() if isinstance(part, Tensor) else part)
-        return cut.replace(births=(), ended=(), arrived=(), reports={})
+        return cut.replace(births=(), ended=(), reports={})
 
     def to(self, device: str | torch.device) -> State:
         """The same state on another device."""
         device = checks.device(device)
-        here = self.moved(lambda part: part.to(device))
-        return here.replace(births=(), ended=(), arrived=(), reports={})
+        return self.moved(lambda part: part.to(device)).replace(births=(), ended=(), reports={})
 
     def moved(self, move: Callable[[Any], Any]) -> State:
         """The state with each tensor, and its layout, as a function returns it."""
@@ -379,6 +378,7 @@ class State:
             **{name: move(getattr(self, name)) for name in (*PER_CELL, *PER_COLONY)},
             fields={n: move(v) for n, v in self.fields.items()},
             layout=None if self.layout is None else move(self.layout),
+            arrived=tuple(a.moved(move) for a in self.arrived),
         )
 
     def uniform(self, rows: Tensor, purpose: str) -> Tensor:

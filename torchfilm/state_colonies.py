@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -41,6 +42,10 @@ class Arrived:
     length: Tensor
     step: int
     time: float
+
+    def moved(self, move: Callable[[Any], Any]) -> Arrived:
+        columns = {n: move(getattr(self, n)) for n in ("colony_id", "uid", "length")}
+        return replace(self, **columns)
 
 
 def note_of(state: State, rows: Tensor, fate: str) -> Ended:

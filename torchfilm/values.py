@@ -124,8 +124,8 @@ def checked(name: str, given: object, rule: Rule, forms: str = FORMS) -> Any:
             return checked_values(name, given, partial(_checked_in_schedule, rule))
         hint = (
             "A Schedule is for the source, flow, reservoir and faces of a Medium, the constants of"
-            " Circuit and Rules (parameters=), Lysis and Motility; rules also call it,"
-            " schedule(cells.time)."
+            " Circuit, Rules and MediumReactions, Lysis, Erosion and Motility. A rule that reads it"
+            " as a constant, cells.p.pace, sets what it should change."
         )
         raise checks.input_error(name, given, "constant", hint)
     if isinstance(given, ByType):

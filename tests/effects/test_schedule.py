@@ -370,9 +370,13 @@ def test_what_no_step_of_a_medium_begins_with_is_lost(recwarn):
     last.warn_of_step("dose", 0.3)
     ramp = {0.01 * k: 1.0 * k for k in range(20)}
     tf.Schedule(ramp).warn_of_mean("dose", 0.1)
-    tf.Schedule({0: 0.0, 0.04: 1.0, 0.15: 0.0}).warn_of_mean("dose", 0.1)
+    tf.Schedule({0: 0.0, 0.14: 1.0, 0.25: 0.0}).warn_of_mean("dose", 0.1)
+    tf.Schedule({t: torch.tensor([x, -x]) for t, x in ramp.items()}).warn_of_mean("dose", 0.1)
     assert not recwarn.list
-    for peak in (tf.Schedule({**ramp, 0.2: 0.0}), tf.Schedule(ramp, period=0.2)):
+    for peak in (
+        tf.Schedule({**ramp, 0.2: 0.0}), tf.Schedule(ramp, period=0.2),
+        tf.Schedule({0: 5.0, 0.01: 0.0}), tf.Schedule({0: {0: 5.0}, 0.01: {0: 0.0}}),
+    ):  # fmt: skip
         with pytest.warns(UserWarning, match=r"dose has the value of 0(\.19)? h for 0\.01 h"):
             peak.warn_of_mean("dose", 0.1)
 

@@ -48,6 +48,9 @@ def test_means_are_those_of_the_values_and_their_times():
         times = np.linspace(begin, end, 7001)[:-1] + (end - begin) / 14000
         assert again.mean(begin, end) == pytest.approx(again(times).mean(), abs=2e-3)
     assert again.shares(2.0 - 1e-12, 2.25) == [(0, 1.0)] == again.shares(2.0, 2.25 + 1e-12)
+    assert tf.Schedule({0: [0.0, 4.0], 1: [2.0, 4.0]}).mean(0.5, 1.5).tolist() == [1.0, 4.0]
+    with pytest.raises(tf.InputError, match=r"from 1 h = .*numbers, of which there is a mean"):
+        tf.Schedule({0: 1.0, 1: {0: 1.0}}).mean(0.5, 1.5)
     with pytest.raises(tf.InputError, match=r"Schedule.mean\(end\) = 1.0"):
         again.mean(1.0, 1.0)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -28,19 +28,31 @@ def births_of(state: State) -> list[Rows]:
     return found
 
 
-def arrivals_of(come: Iterable[Arrived]) -> list[Rows]:
-    """Cells that came from outside, as births without a parent."""
+def arrivals_of(come: Sequence[Arrived], state: State) -> list[Rows]:
+    """Cells that came from outside before the step to a state, as births without a parent; without
+    those that were taken out again before it."""
     found: list[Rows] = []
+    if not come:
+        return found
+    there = _keys([(state.own_colony_id, state.uid), *((e.colony_id, e.uid) for e in state.ended)])
     for a in come:
-        none, steps, times = (np.full(a.uid.numel(), x) for x in (-1, a.step, a.time))
-        ids, uid, length = (numpy_of(x) for x in (a.colony_id, a.uid, a.length))
+        own = zip(a.colony_id.tolist(), a.uid.tolist(), strict=True)
+        kept = torch.tensor([key in there for key in own], dtype=torch.bool)
+        ids, uid, length = (numpy_of(x)[kept.numpy()] for x in (a.colony_id, a.uid, a.length))
+        none, steps, times = (np.full(len(uid), x) for x in (-1, a.step, a.time))
         found.append((ids, uid, none, steps, length, times))
     return found
 
 
-def just_arrived(state: State) -> list[Arrived]:
-    """What was added to a state since its step."""
-    return [a for a in state.arrived if a.step == state.step]
+def just_arrived(state: State, next_uid: np.ndarray | None = None) -> list[Arrived]:
+    """What was added to a state since its step. next_uid: (B,), of the colonies as they are known;
+    without the cells that they have."""
+    found = [a for a in state.arrived if a.step == state.step]
+    if next_uid is None:
+        return found
+    known = dict(zip(state.colony_id.tolist(), next_uid.tolist(), strict=True))
+    # one call of `Model.add` after the other, so that a note is known as a whole or not at all
+    return [a for a in found if int(a.uid[0]) >= known[int(a.colony_id[0])]]
 
 
 def arrived_since(before: State, state: State) -> list[Arrived]:
@@ -67,7 +79,7 @@ def removed_before(state: State, before: State) -> list[Ended]:
     did not end in the step."""
     ended = sum(e.uid.numel() for e in state.ended)
     born = sum(b.uid.numel() for b in state.births)
-    come = sum(a.uid.numel() for a in arrived_since(before, state))
+    come = sum(len(uid) for _, uid, *_ in arrivals_of(arrived_since(before, state), state))
     if state.cells == before.cells + born + come - ended:
         return []
     there = _keys([(state.own_colony_id, state.uid), *((e.colony_id, e.uid) for e in state.ended)])

@@ -13,6 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from torchfilm.distributions import LogNormal, Normal, Uniform
+from torchfilm.founders import Founders
 from torchfilm.io.layout import numpy_of
 from torchfilm.io.reading import blaming_file
 from torchfilm.scene import Scene
@@ -23,15 +24,21 @@ SLASH = "\u2215"  # in a path, for the "/" that separates HDF5 groups
 
 
 def write_parameters(
-    file: h5py.File, scene: Scene, colony_id: Tensor, step: int, *, changed: bool = False
-) -> None:
+    file: h5py.File, scene: Scene, colony_id: Tensor, step: int, *, changed: bool = False,
+    by_founders: bool = True,
+) -> None:  # fmt: skip
     """Store the values of the colonies (B,) from `step` on. Those that the file holds, if they
-    differ, stay those of the frames up to that step. changed: the frames so far are of another
-    scene, so that their values are not known where the file holds none."""
+    differ, stay those of the frames up to that step; those of founders, which have been, stay.
+    changed: the frames so far are of another scene, so that their values are not known where the
+    file holds none. by_founders: whether the colonies began with the scene's founders."""
     earlier, own = f"{UNTIL}/{step}", numpy_of(colony_id)
+    of_founders = lambda path: path.startswith(f"{Founders.__name__}.")
     given = {path: numpy_of(x)[own] for path, x in scene.per_colony()}
+    if NOW in file or not by_founders:
+        given = {path: x for path, x in given.items() if not of_founders(path)}
     if NOW in file:
         before = _values(file[NOW])
+        given |= {path: x for path, x in before.items() if of_founders(path)}
         if before.keys() == given.keys() and all(_alike(before[n], given[n]) for n in given):
             return
         if earlier in file:

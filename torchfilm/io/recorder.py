@@ -144,7 +144,7 @@ class Recorder(metaclass=checks.KnownKeywords):
             return
         by_hand = [] if before is None else events.removed_before(state, before)
         come = [] if before is None else events.arrived_since(before, state)
-        self.births += events.arrivals_of(come) + events.births_of(state)
+        self.births += events.arrivals_of(come, state) + events.births_of(state)
         self.ends += events.ends_of(state, [*self.absent, *by_hand, *state.ended])
         self.absent = []
         if (state.step - self.first_step) % self.every == 0:
@@ -210,7 +210,8 @@ class Recorder(metaclass=checks.KnownKeywords):
         for name, value in self._attributes(state).items():
             self.file.attrs[name] = value
         create_tables(self.file, state)
-        write_parameters(self.file, self.scene, state.colony_id, state.step)
+        own = self.model is None or not self.model.cells_given
+        write_parameters(self.file, self.scene, state.colony_id, state.step, by_founders=own)
         self.file.swmr_mode = True
         hold.enter_context(replacing.held(self.source))
         self._write(state)
@@ -241,7 +242,8 @@ class Recorder(metaclass=checks.KnownKeywords):
         with Results(self.path) as kept:
             self._check_resumed(kept, state)
             self.absent = events.absent_from(state, kept.frame(), kept.colony_id)
-            self.births += events.arrivals_of(events.just_arrived(state))
+            come = events.just_arrived(state, kept.next_uid())
+            self.births += events.arrivals_of(come, state)
             self.written, self.first_step = int(kept.steps[-1]), int(kept.steps[0])
         check_room(
             self.target, self.target.stat().st_size, f"to resume {self.path}, by a copy of it",
@@ -297,7 +299,7 @@ class Recorder(metaclass=checks.KnownKeywords):
         keys = lambda ids, uid: {*zip(ids.tolist(), uid.tolist(), strict=True)}
         frame = kept.frame()
         known = keys(kept.colony_id[frame["colony"]], frame["uid"])
-        come = events.just_arrived(state)
+        come = events.just_arrived(state, kept.next_uid())
         known |= {key for a in come for key in keys(a.colony_id, a.uid)}
         same = np.array_equal(
             kept.next_uid(), numpy_of(state.next_uid - events.numbers_of(come, state))

@@ -11,6 +11,8 @@ from numbers import Real
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from torchfilm.tools import checks
 from torchfilm.tools.parts import mapped, parts_of
@@ -129,8 +131,12 @@ class Schedule(metaclass=checks.KnownKeywords):
         to `end` has it in a circuit. Raises InputError for an end that is not later."""
         begin = checks.number("Schedule.mean(begin)", begin)
         end = checks.number("Schedule.mean(end)", end, above=begin)
-        held = list(self.values.values())
+        held = [np.array(x) if isinstance(x, list) else x for x in self.values.values()]
         shares = self.shares(begin, end)
+        for k, _ in shares:
+            if not isinstance(held[k], Real | np.ndarray | Tensor):
+                what = f"Schedule.values, from {self.times[k]:g} h"
+                raise checks.input_error(what, held[k], "numbers, of which there is a mean")
         if len(shares) == 1:
             return held[shares[0][0]]
         return sum(share * held[k] for k, share in shares)
@@ -139,7 +145,7 @@ class Schedule(metaclass=checks.KnownKeywords):
         """Warn where a value of `what` holds for less than a step of dt hours, and so never in a
         whole one."""
         for k, (time, length) in enumerate(zip(self.times, self._lengths, strict=True)):
-            if length < dt * (1 - 1e-6) and not self._between(k):
+            if length < dt * (1 - 1e-6) and not self._between(k, dt):
                 warn(
                     f"{what} has the value of {time:g} h for {length:.3g} h, less than a step of"
                     f" {dt:g} h. Steps take the mean over their time: the dose is right, but what"
@@ -147,14 +153,17 @@ class Schedule(metaclass=checks.KnownKeywords):
                 )
                 return
 
-    def _between(self, place: int) -> bool:
-        """Whether a value is a number between those before and after it, as of a ramp."""
-        held = [*self.values.values()]
-        beside = held[max(place - 1, 0)], held[min(place + 1, len(held) - 1)]
-        if self.period is not None:
-            beside = held[place - 1], held[(place + 1) % len(held)]
-        numbers = [x for x in (*beside, held[place]) if isinstance(x, Real)]
-        return len(numbers) == 3 and min(beside) <= held[place] <= max(beside)
+    def _between(self, place: int, dt: float) -> bool:
+        """Whether a value that holds for less than a step is between those before and after it, as
+        of a ramp; or the first of several that do."""
+        held = [torch.as_tensor(x) for x in self.values.values() if _is_number(x)]
+        if len(held) < len(self.values):
+            return False
+        before, after = held[place - 1], held[(place + 1) % len(held)]
+        if place == 0 and self.period is None:
+            return self._lengths[1] < dt
+        low, high = torch.minimum(before, after), torch.maximum(before, after)
+        return bool(((low <= held[place]) & (held[place] <= high)).all())
 
     def warn_of_step(self, what: str, dt: float) -> None:
         """Warn where steps of dt hours, each with the value that holds as it begins, do not follow
@@ -189,6 +198,11 @@ class Schedule(metaclass=checks.KnownKeywords):
         times = ", ".join(f"{t:g}" for t in self.times[1:])
         again = "" if self.period is None else f" and every {self.period:g} h anew"
         return f"changes at {times} h{again}" if times else "stays as it is"
+
+
+def _is_number(value: Any) -> bool:
+    """Whether it is a number, or one per colony, without cell types."""
+    return isinstance(value, Real | np.ndarray | Tensor | list)
 
 
 def _listed(times: Sequence[float]) -> str:
