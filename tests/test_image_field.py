@@ -42,7 +42,7 @@ def test_sharp_pixels_have_one_number_each():
 def test_beyond_the_rim_is_outside():
     assert at(3.01, 0.0) == at(0.0, 1.01) == at(-3.01, 0.0) == at(0.0, -1.01) == 0.0
     assert at(3.01, 0.0, outside=-7.0) == -7.0
-    assert at(3.0, 0.5) == 2.0
+    assert at(3.0, 0.5) == 2.0 and at(0.0, -1.0) == 4.0
 
 
 def test_one_pixel_fills_the_image():
@@ -139,6 +139,12 @@ def test_another_image_is_another_scene(tmp_path):
         assert results.state(shone_on(same)).cells == 2
         with pytest.raises(tf.InputError, match="other"):
             results.state(shone_on(other))
+
+
+@pytest.mark.parametrize("more", [{"centre": (1.0, 0.0)}, {"outside": 1.0}, {"smooth": False}])
+def test_an_image_that_is_read_otherwise_is_another_scene(more):
+    one, other = (tf.ImageField(STRIPES, (20.0, 20.0), **given) for given in ({}, more))
+    assert tf.digest(one) != tf.digest(other) == tf.digest(tf.ImageField(STRIPES, (20, 20), **more))
 
 
 def test_derivatives_reach_the_pixels_of_a_source_and_of_a_rule():

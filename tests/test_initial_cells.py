@@ -490,3 +490,5 @@ def test_numbers_that_leave_colonies_empty_are_warned_of():
 def test_names_are_no_numbers_of_colonies():
     with pytest.raises(tf.InputError, match=r"colony = 20250131.*below 100000.*np|numpy\.unique"):
         tf.Cells([[0.0, 0.0], [0.0, 3.0]], [1.0, 0.0], colony=[0, 20250131])
+    number = 9 * np.arange(12_000)  # gaps, but not so many
+    assert tf.Cells(np.zeros((12_000, 2)), [1.0, 0.0], colony=number).colonies == 107_992

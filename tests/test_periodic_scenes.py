@@ -272,3 +272,13 @@ def test_a_film_has_a_floor():
         tf.measure.film(state.replace(space=None), across=(0, 10))
     film = tf.measure.film(state.replace(space=None), 16.0, across={"x": (0.0, 40.0)})
     assert film.height.shape == (1, 3)  # of 13.3 µm
+
+
+def test_how_far_cells_moved_is_counted_across_faces():
+    """One that is pushed out at a face comes in at the other, and has hardly moved."""
+    table = {"x_px": [0.5, 6.0], "y_px": [50.0, 50.0], "angle_rad": [1.57, 1.57],
+             "length_px": [20.0, 20.0]}  # fmt: skip
+    cells = tf.Cells.from_table(table, pixel_size=0.1, radius=0.5)
+    apart = cells.relaxed(periodic={"x": (0.0, 20.0)})
+    assert apart.position[0, 0] > 19.0
+    assert np.all((apart.micrograph.moved > 0.1) & (apart.micrograph.moved < 0.5))

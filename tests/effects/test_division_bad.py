@@ -210,3 +210,17 @@ def test_exactly_two_radii_may_divide():
     """l = 2r leaves two spheres: the limit, and allowed."""
     scene = tf.Scene(tf.Division(), founders=row_of_cells(1, 1.0))
     assert step(scene, flagged(scene), 0.1).length.tolist() == [0.0, 0.0]
+
+
+def test_beside_a_colony_that_cannot_divide_each_keeps_its_own_fraction():
+    """The first colony fails; cells of the others get their own shares, also drawn ones."""
+    for fraction in ([0.4, 0.25, 0.3], tf.Uniform([0.4, 0.25, 0.3], [0.41, 0.26, 0.31])):
+        scene = tf.Scene(
+            tf.Division(fraction=fraction, axis_noise=0.0), founders=row_of_cells(1, 3.0)
+        )
+        state = flagged(scene, 3)
+        state = state.replace(length=state.length.clone().index_fill(0, torch.tensor([0]), 0.6))
+        after = step(scene, state, 0.1)
+        assert after.reports["division"].status.tolist() == [1, 0, 0]
+        share = (after.length[1::2] + 1.0) / 4.0  # of the length with caps, 4 µm
+        assert share.tolist() == pytest.approx([0.25, 0.3], abs=0.01)

@@ -10,6 +10,7 @@ import torch
 from helpers import step
 
 import torchfilm as tf
+from torchfilm.effects import compiled_division
 
 
 def one_cell(length: float = 2.0) -> tf.Cells:
@@ -186,6 +187,21 @@ def test_thresholds_by_cell_type_are_inherited():
         scene = tf.Scene(tf.Growth(rate=1.0), division, founders=founders, dt=0.05)
         *_, state = tf.simulate(scene, until=3.0, seed=1)
         assert state.cells >= 16 and state.division_threshold.unique().numel() == 2
+
+
+@pytest.mark.parametrize("by_torch", [False, True])
+def test_thresholds_are_drawn_as_for_the_type_of_each_cell(by_torch, monkeypatch):
+    """By kernels, too, which draw evenly between two numbers that are the same for all cells."""
+    pytest.importorskip("numba")
+    if by_torch:
+        monkeypatch.setattr(compiled_division, "kernels_loaded", lambda value: False)
+    laws = {0: tf.Uniform(3.0, 3.5), 1: tf.Uniform(6.0, 6.5)}
+    founders = tf.Cells([[0.0, 0.0], [50.0, 0.0]], [[1.0, 0.0]] * 2, 2.0, cell_type=[0, 1])
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=laws), founders=founders, dt=0.05)
+    *_, state = tf.simulate(scene, until=2.5)
+    assert torch.bincount(state.cell_type).min() >= 4
+    over = state.division_threshold - torch.where(state.cell_type == 0, 3.0, 6.0)
+    assert over.unique().numel() == state.cells and 0.0 <= over.min() <= over.max() <= 0.5
 
 
 @pytest.mark.parametrize("conserves", ["length", "volume"])

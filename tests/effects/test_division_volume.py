@@ -64,3 +64,18 @@ def test_a_free_colony_of_any_division_length_grows_as_its_law():
 def test_another_word_is_refused():
     with pytest.raises(tf.InputError, match=r"Division.conserves = 'area'.*'length', 'volume'"):
         tf.Division(length=4.0, conserves="area")
+
+
+@pytest.mark.parametrize("by_torch", [False, True])
+def test_a_cell_may_be_as_short_as_its_volume_allows(by_torch, monkeypatch):
+    """Two balls of radius 0.4 hold as much as a cell of 4/3 · 0.4 µm: far less than two radii."""
+    if by_torch:
+        monkeypatch.setattr("torchfilm.effects.division.knows_due", lambda *_: False)
+    division = tf.Division(conserves="volume", axis_noise=0.0)
+    for length, status in ((0.54, 0), (0.52, 1)):
+        cell = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], length=[length], radius=[0.4])
+        model = tf.Scene(division, founders=cell).bind(dtype=F64)
+        state = model.step(model.start().with_fields(divide_flag=torch.tensor([True])), 0.1)
+        report = state.reports.get("division")
+        assert (0 if report is None else int(report.status)) == status
+        assert state.cells == 2 - status

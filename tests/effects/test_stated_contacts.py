@@ -93,6 +93,10 @@ def test_numbers_beyond_those_of_float32():
         with pytest.raises(tf.InputError, match=r"at most 3\.4e\+38 with float32"):
             scene.bind().start()
         assert bool(torch.isfinite(scene.bind(dtype=torch.float64).start().signals["a"]).all())
+    later = tf.Schedule({0: 1.0, 1: 1e300})
+    scene = tf.Scene(tf.Medium(a=tf.Signal(10.0, source=later), **box), dim=2)
+    with pytest.raises(tf.InputError, match=r"source of the signal 'a' = 1e\+300 .*3\.4e\+38"):
+        scene.bind().start()
 
 
 @pytest.mark.parametrize(
@@ -125,3 +129,28 @@ def test_a_first_cell_straight_across_a_channel():
             tf.Scene(tf.Mechanics(dim=2, walls=[box])).bind()
     *_, last = tf.simulate(across(1e-4), until=1.0)
     assert float(last.axis[0, 0].abs()) > 0.9, "it lies along the channel"
+
+
+def test_each_colony_has_the_room_of_its_own_wall():
+    """A cell of 3 µm, in a ball that is wide in the first colony and not in the second."""
+    scene = tf.Scene(tf.Mechanics(dim=2, walls=[tf.Sphere((0.0, 0.0), [9.0, 1.4])]))
+    with pytest.warns(RuntimeWarning, match=r"of colony 1 is 3 µm long.* room for 2\.8 µm"):
+        scene.bind(2)
+
+
+def test_a_cell_wider_than_a_channel_gets_one_warning():
+    """It also lies across, which does not matter then."""
+    founders = tf.Cells([[2.0, 0.0]], [[0.0, 1.0]], length=2.0, radius=0.7)
+    mechanics = tf.Mechanics(dim=2, walls=[tf.Channel(1.2, low_end=0.0)])
+    with pytest.warns(Warning) as told:
+        tf.Scene(tf.Growth(rate=1.0), mechanics, founders=founders, dt=0.05).bind()
+    assert ["too narrow" in str(w.message) for w in told] == [True]
+
+
+@pytest.mark.parametrize(("apart", "words"), [(0.3, "deep in one another"), (1e-5, "deep in one"),
+                                              (1e-8, "at the same place")])  # fmt: skip
+def test_a_small_cell_in_a_large_one_is_noticed(apart, words):
+    """It overlaps by more than its own radius of 0.2 µm, and by less than the other's of 0.6."""
+    founders = tf.Cells([[0.0, 0.0], [0.0, apart]], [1.0, 0.0], 0.0, radius=[0.6, 0.2])
+    with pytest.warns(RuntimeWarning, match=words):
+        tf.Scene(tf.Mechanics(dim=2), founders=founders).bind()
