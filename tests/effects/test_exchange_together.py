@@ -195,6 +195,30 @@ def test_cells_in_a_reservoir_and_signals_without_cells():
     assert float(after.signals["ahl"].sum()) == pytest.approx(float(left.signals["ahl"].sum()))
 
 
+@pytest.mark.parametrize("reservoir", [0.0, 9.0])
+@pytest.mark.parametrize("diffusion", [30.0, 1e5])
+def test_both_backends_keep_what_cells_beyond_the_box_exchange_out_of_it(reservoir, diffusion):
+    """The box has what its source and the cell inside give, to rounding, whatever the other gives
+    or takes."""
+    cells = tf.Cells([[0.0, 0.0], [30.0, 0.0]], [[1.0, 0.0]] * 2, 2.0)
+    ahl = tf.Signal(diffusion, initial=1.0, reservoir=reservoir, source=0.7)
+    ends = []
+    for backend in ("compiled", "torch"):
+        around = tf.Medium(
+            ahl=ahl, box=BOX, spacing=4.0, exchange="together", outside="reservoir", backend=backend
+        )
+        made = resting(around, exchanging(4.0, D1=2.0, backend=backend, **TIGHT), cells)
+        start = made.bind(dtype=F64).start()
+        ends.append(advance(made, start, 3, DT))
+        inside = lambda state: totals(state, inside=False) - state.ahl_reservoir
+        gave = float((start.ahl[0] - ends[-1].ahl[0]) * start.volume[0])
+        gave += 0.7 * start.layout.grid.nodes * start.layout.grid.voxel_volume * 3 * DT
+        assert float(inside(ends[-1]) - inside(start)) == pytest.approx(gave, rel=1e-8)
+        assert bool((ends[-1].ahl[1] > 4.0) == (reservoir > 4.0))
+    for name in ("ahl", "out.ahl", "ahl_reservoir"):
+        torch.testing.assert_close(*(end.fields[name] for end in ends), rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.parametrize("exchange", ["turns", "together"])
 @pytest.mark.parametrize("backend", ["compiled", "torch"])
 def test_a_reservoir_of_nothing_takes_from_cells_that_had_nothing(exchange, backend):

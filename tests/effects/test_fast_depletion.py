@@ -122,21 +122,26 @@ def test_it_is_explained():
     assert "in parts" not in " ".join(together_lines({"drug": 100.0}))
 
 
-def test_which_colonies_are_coarse():
+@pytest.mark.parametrize("batches", [[[0, 1, 2, 3, 4]], [[1, 3], [0, 2, 4]]])
+def test_which_colonies_are_coarse(batches):
     """Those that took backward Euler and took more than 2 % of what there was, in the geometric
     mean with the change; whether that was a fall, or a rise in spite of it; not one with nothing
-    to take."""
-    voxels = 4
+    to take. Grids may be of several shapes."""
+    voxels, volume = 4, 2.0
     owner = torch.arange(5).repeat_interleave(voxels)
-    content = lambda values: torch.tensor(values, dtype=F64).repeat_interleave(voxels) / voxels
+    content = lambda values: (
+        torch.tensor(values, dtype=F64).repeat_interleave(voxels) / (voxels * volume)
+    )
     before, after = content([1.0, 1.0, 1.0, 1.0, 1e-9]), content([0.9, 0.9, 1.1, 0.999, 5e-10])
     taken = torch.tensor([0.1, 0.1, 0.1, 0.1, 5e-10], dtype=F64)
+    places = [torch.tensor(k) for k in batches]
+    far = torch.tensor([True, False, True, True, True])
     grid = SimpleNamespace(
-        owner=owner, voxel_volume=1.0, batches=[SimpleNamespace(colonies=torch.arange(5))]
+        owner=owner, voxel_volume=volume, batches=[SimpleNamespace(colonies=k) for k in places]
     )
     given = SimpleNamespace(
         groups=Groups(torch.arange(5), 5, ordered=True), field=before, grid=grid, finest=1e-6,
-        _far=[torch.tensor([True, False, True, True, True])],
+        _far=[far[k] for k in places],
     )  # fmt: skip
     moved = joint.Moved(after, taken, taken, taken)
     found = joint.JointTransport.coarse(given, moved)

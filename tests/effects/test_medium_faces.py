@@ -36,6 +36,44 @@ def test_in_a_flow_the_faces_that_nobody_names_are_open(where):
     assert float(state.signals["food"].mean()) == pytest.approx(1.0, rel=1e-5)
 
 
+@pytest.mark.parametrize("axis", "xyz")
+def test_faces_are_open_along_any_axis_of_a_flow(axis):
+    """In half an hour half of what was there has left, and nothing came in."""
+    other = tf.BoundaryConditions(**{{"x": "y", "y": "z", "z": "x"}[axis]: tf.NoFlux()})
+    medium = tf.Medium(
+        food=tf.Signal(0.0, initial=1.0), box=[[-16.0] * 3, [16.0] * 3], spacing=4.0,
+        flow=[32.0 if a == axis else 0.0 for a in "xyz"], boundary=other,
+    )  # fmt: skip
+    *_, state = tf.simulate(still(medium), until=0.5, dt=0.1)
+    assert float(state.signals["food"].mean()) == pytest.approx(0.5, abs=0.05)
+
+
+VALUES = [1.0, 2.0, 4.0]
+
+
+@pytest.mark.parametrize(
+    "face",
+    [
+        tf.Dirichlet(VALUES), tf.Robin(VALUES, 50.0), tf.Robin(1.0, [10.0, 50.0, 200.0]),
+        tf.Flux(VALUES), tf.Open(VALUES), tf.Dirichlet(tf.Schedule({0: tf.PerColony(VALUES)})),
+    ],
+    ids=lambda face: type(face).__name__,
+)  # fmt: skip
+def test_colonies_keep_their_own_faces_where_others_are_left_out(face):
+    """What enters is that of the colony's id, and not of its place in the batch."""
+    faces = tf.BoundaryConditions(x=(face, tf.NoFlux()))
+    flow = (20.0, 0.0) if isinstance(face, tf.Open) else None
+    medium = tf.Medium(
+        food=tf.Signal(100.0), box=((-16, -8), (16, 8)), spacing=4.0, flow=flow, boundary=faces
+    )
+    model = tf.Scene(medium, dim=2).bind(3, dtype=torch.float64)
+    levels = lambda state: model.step(state, 0.1).signals["food"].reshape(state.colonies, -1)
+    start = model.start()
+    whole, part = levels(start), levels(start.select([2, 0]))
+    assert torch.equal(part, whole[[2, 0]])
+    assert bool((whole.sum(1).diff() > 0.1).all())
+
+
 def test_without_a_flow_they_are_closed():
     """And the description of the scene is that of all faces said."""
     some = tf.Medium(**FOOD, box=BOX, boundary=tf.BoundaryConditions(z=tf.Dirichlet(1.0)))

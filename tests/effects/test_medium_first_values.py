@@ -29,6 +29,8 @@ def test_first_values_are_drawn_by_seed_and_colony():
     assert float((first.std(1) - 0.1).abs().max()) < 4 * 0.1 / math.sqrt(2 * 1600)
     assert not torch.equal(first[0], first[1])
     assert torch.equal(model.start().select([2, 0]).signals["m"].view(2, -1), first[[2, 0]])
+    alone = noisy(tf.Normal(1.0, 0.1)).bind(streams=[2], seed=5).start().signals["m"]
+    assert torch.equal(alone, first[2])
     other = noisy(tf.Normal(1.0, 0.1)).bind(3, seed=6).start().signals["m"].view(3, -1)
     assert not bool((other == first).any(1).all())
     per_colony = tf.Uniform([0.0, 2.0, 4.0], [1.0, 3.0, 5.0])

@@ -281,3 +281,28 @@ def test_a_flow_may_be_stated_for_each_colony():
         for x in (tf.PerColony([0.0, 30.0]), [0.0, 30.0])
     ]  # fmt: skip
     assert flows[0].tolist() == flows[1].tolist() == [0.0, 30.0]
+
+
+def everywhere(flow):
+    return lambda at: at.new_tensor(flow).expand(at.shape)
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+@pytest.mark.parametrize("given", [tuple, everywhere], ids=["numbers", "function"])
+def test_a_flow_carries_alike_along_each_axis(axis, given):
+    """What it brings in through the low face, in space: as along x."""
+
+    def filled(k):
+        flow = given([30.0 if n == k else 0.0 for n in range(3)])
+        faces = tf.BoundaryConditions(**{"xyz"[k]: (tf.Dirichlet(1.0), tf.Open())})
+        medium = tf.Medium(
+            a=tf.Signal(diffusion=40.0), box=((-8.0,) * 3, (8.0,) * 3), spacing=4.0, flow=flow,
+            boundary=faces,
+        )  # fmt: skip
+        scene = tf.Scene(medium, dim=3)
+        state = advance(scene, scene.bind(dtype=F64).start(), 2, 0.1)
+        return state.signals["a"].reshape(4, 4, 4)
+
+    along_x = filled(0)
+    assert float(along_x[0].min()) > 1.2 * float(along_x[3].max()) > 0.1
+    torch.testing.assert_close(filled(axis).transpose(0, axis), along_x, rtol=1e-9, atol=0)

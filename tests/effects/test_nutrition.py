@@ -222,14 +222,18 @@ def test_without_food_nothing_happens(dtype):
     )
 
 
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
 @pytest.mark.parametrize("away", [2e-3, 40.0])
-def test_a_cell_beyond_an_open_box_eats_from_the_reservoir(away):
+def test_a_cell_beyond_an_open_box_eats_from_the_reservoir(away, backend):
     """Hard case 38: what it eats is kept count of, and the box does not lose it."""
     scene = tf.Scene(
         tf.Monod("food", rate=1.0, half=1.0, growth_yield=2.0),
         tf.Growth(),
         tf.Medium(
-            food=tf.Signal(diffusion=0.0, initial=1.0, reservoir=3.0), outside="reservoir", **BOX
+            food=tf.Signal(diffusion=0.0, initial=1.0, reservoir=3.0),
+            outside="reservoir",
+            backend=backend,
+            **BOX,
         ),
         founders=tf.Cells([[0.0, 0.0], [0.0, 3.0]], [1.0, 0.0]),
     )

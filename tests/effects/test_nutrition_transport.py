@@ -332,3 +332,27 @@ def test_how_deep_a_nutrient_reaches_into_a_dense_layer(wanted):
     growth = state.growth_rate.view(30, 2)[:, 0]
     assert float(growth[fed].min()) > 0.9 * rate
     assert float(growth[at > wanted + 2 * spacing].max()) < 0.1 * rate
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_a_source_feeds_each_colony_at_its_own_rate_of_exchange(backend):
+    """With others whose nutrient diffuses faster, which need more terms of the series, as alone."""
+
+    def fed(diffusion, **batch):
+        food = tf.Signal(diffusion=diffusion, decay=0.1, initial=0.1, source=0.5)
+        medium = tf.Medium(
+            food=food, box=((-8, -8), (8, 8)), spacing=2.0, depth=1.0, backend=backend
+        )
+        scene = tf.Scene(tf.Monod("food", rate=1.0, half=0.3), tf.Growth(), medium, dim=2)
+        model = scene.bind(dtype=F64, **batch)
+        state = model.start()
+        for _ in range(3):
+            state = model.step(state, 0.05)
+        return state
+
+    own = [400.0, 1.0, 40.0]
+    together = fed(own)
+    for k, diffusion in enumerate(own):
+        alone, mine = fed([diffusion], streams=[k]), together.select([k])
+        for name in ("out.food", "food_eaten"):
+            torch.testing.assert_close(mine.fields[name], alone.fields[name], rtol=1e-12, atol=0)

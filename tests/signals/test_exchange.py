@@ -183,8 +183,11 @@ def test_however_crowded_nothing_goes_below_zero_and_nothing_is_lost(
     )
 
 
-def test_taking_more_than_is_there_shows(device, dtype):
+@pytest.mark.parametrize("by_torch", [False, True])
+def test_taking_more_than_is_there_shows(by_torch, device, dtype, monkeypatch):
     """Too large an uptake is not silent: a value below zero, or NaN where there was nothing."""
+    if by_torch:
+        monkeypatch.setattr(compiled, "may_run", lambda *_: False)
     g = grid([(3, 3, 1)], device)
     found = stencil(
         g, g.centres()[4:5], torch.zeros(1, dtype=torch.int64, device=device), dtype=dtype

@@ -55,6 +55,23 @@ def test_steps_belong_to_one_grid_and_go_with_it():
     assert set(carriers) == {first.layout.grid}
 
 
+@pytest.mark.parametrize("given", [{}, {"method": "series"}, {"splitting": "lie"}])
+def test_a_model_takes_steps_of_any_length_on_one_grid(given):
+    """What is kept of a step of one length serves none of another."""
+    drop = lambda at: (at[:, 0] > 0).double()
+    medium = tf.Medium(
+        a=tf.Signal(50.0, decay=1.0, initial=drop), box=((-8.0, -8.0), (8.0, 8.0)), spacing=4.0,
+        **given,
+    )  # fmt: skip
+    scene = tf.Scene(medium, dim=2)
+    model = scene.bind(dtype=F64)
+    start = model.start()
+    for dt in (0.1, 0.025, 0.1):
+        fresh = scene.bind(dtype=F64)
+        alone = fresh.step(fresh.start(), dt).signals["a"]
+        assert torch.equal(model.step(start, dt).signals["a"], alone)
+
+
 def test_a_layout_of_other_colonies_finds_their_voxels(device):
     layout = Layout(grid(device), height=0.5, reservoir={"a": 1.0})
     values = torch.arange(layout.grid.nodes, device=device)
@@ -68,6 +85,27 @@ def test_a_layout_of_other_colonies_finds_their_voxels(device):
     assert torch.equal(part.grid.centres(), layout.grid.centres()[rows])
     every, rows = layout.take(torch.tensor([0, 1, 2], device=device))
     assert torch.equal(rows, values) and every.grid.shapes == layout.grid.shapes
+
+
+@pytest.mark.parametrize("turn", [0, 1, 2])
+def test_a_flow_is_asked_for_at_the_faces_of_each_colony(turn, device):
+    """Its components are those of the position, in turn, so that they tell where that is."""
+    own = grid(device)
+    for batch in own.batches:
+        for axis, found in enumerate(Layout(own).on_faces(lambda at: at.roll(turn, 1), batch)):
+            k = (axis - turn) % 3
+            lines = torch.arange(batch.shape[k] + (k == axis), device=device, dtype=F64)
+            lines = (lines + (0.0 if k == axis else 0.5)) * own.step[k]
+            for place, colony in enumerate(batch.colonies.tolist()):
+                mine, at = found[place].movedim(k, -1), own.origin[colony, k] + lines
+                assert torch.equal(mine, at.expand(mine.shape))
+
+
+def test_a_flow_of_two_components_has_none_along_z():
+    flow = lambda at: at.new_tensor([1.0, 2.0]).expand(len(at), 2)
+    for batch in grid().batches:
+        means = [float(v.mean()) for v in Layout(grid()).on_faces(flow, batch)]
+        assert means == [1.0, 2.0, 0.0]
 
 
 def test_a_layout_moves_to_a_device(device):
