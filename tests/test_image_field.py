@@ -141,6 +141,17 @@ def test_another_image_is_another_scene(tmp_path):
             results.state(shone_on(other))
 
 
+def test_a_place_that_is_no_number_is_outside():
+    pixels = torch.tensor([[1.0, 2.0], [3.0, 4.0]], dtype=torch.float64, requires_grad=True)
+    nan, inf = float("nan"), float("inf")
+    places = torch.tensor([[nan, 0.0], [0.0, inf], [-0.5, 0.5]], dtype=torch.float64)
+    for smooth in (True, False):
+        found = tf.ImageField(pixels, (2.0, 2.0), outside=7.0, smooth=smooth)(places)
+        assert found.tolist() == [7.0, 7.0, 1.0]
+        (slope,) = torch.autograd.grad(found.sum(), pixels)
+        assert slope.tolist() == [[1.0, 0.0], [0.0, 0.0]]
+
+
 @pytest.mark.parametrize("more", [{"centre": (1.0, 0.0)}, {"outside": 1.0}, {"smooth": False}])
 def test_an_image_that_is_read_otherwise_is_another_scene(more):
     one, other = (tf.ImageField(STRIPES, (20.0, 20.0), **given) for given in ({}, more))

@@ -159,6 +159,8 @@ def test_founders_and_late_movies_have_clones_and_branches_of_their_own():
     rows = [(1, 0, 0, 2.0), (1, 0, 60, 2.0), (2, 0, 0, 2.0), (2, 0, 60, 2.0)]
     tree = tf.Lineage.from_table(table(rows))
     assert tree.clone_sizes() == {1: 1, 2: 1} == tree.clone_sizes(time=0.0)
+    lost = tf.Lineage.from_table(table([*rows, (2, 0, 120, 2.0), (2, 0, 180, 2.0)]))
+    assert lost.clone_sizes(time=1.0) == {1: 1, 2: 1} and lost.clone_sizes(time=1.5) == {1: 0, 2: 1}
     late = [(1, 0, 0, 2.0), (1, 0, 60, 2.0), (1, 0, 300, 2.0), (1, 0, 600, 2.0)]
     both = tf.Lineage.from_table(table(late, colony=[0, 0, 1, 1]))
     assert both.to_newick(0) == "colony0.cell1:1;\n" and both.to_newick(1) == "colony1.cell1:5;\n"

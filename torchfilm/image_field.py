@@ -63,6 +63,8 @@ class ImageField(metaclass=checks.KnownKeywords):
         image = self._chosen(position, which)
         at = [position[:, k].double() - self.centre[k] for k in (0, 1)]
         inside = (at[0].abs() <= 0.5 * self.size[0]) & (at[1].abs() <= 0.5 * self.size[1])
+        # a place that is not finite is outside, and has no pixel
+        at = [torch.where(inside, a, 0.0) for a in at]
         # in pixels, from the middle of the first; the outermost number goes on to the rim
         counts = pixels.shape[2], pixels.shape[1]
         x, y = (

@@ -279,8 +279,10 @@ class Lineage:
         if time is not None:
             when = checks.number("clone_sizes(time)", time, least=self.begin, most=self.now)
         mine = self.colony == self.colony_of_run(colony)
-        # a mother ends when her daughters are born; what has an unknown end is gone
-        there = (self.first_seen <= when) & ((self.fate == "alive") | (self.ended > when))
+        # a mother ends when her daughters are born; what has an unknown end is gone; a lost cell is
+        # there in its last frame
+        ends = (self.ended > when) | ((self.fate == LOST) & (self.ended == when))
+        there = (self.first_seen <= when) & ((self.fate == "alive") | ends)
         alive = self.founder[mine & there]
         return {int(f): int((alive == f).sum()) for f in np.unique(self.founder[mine])}
 
