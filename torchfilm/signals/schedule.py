@@ -6,6 +6,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property
 from numbers import Real
 from typing import Any
@@ -171,7 +172,8 @@ class Schedule(metaclass=checks.KnownKeywords):
         if lost := self._lost(dt):
             warn(
                 f"{what} has the value of {_listed(lost)} h in no step of"
-                f" {dt:g} h: it is lost. Take a shorter dt, of which the times are multiples."
+                f" {dt:g} h: it is lost. Take a shorter dt, of which the times are"
+                f" multiples{self._fitting(dt)}."
             )
             return
         moments = (*self.times, self.period or 0.0)
@@ -180,8 +182,19 @@ class Schedule(metaclass=checks.KnownKeywords):
             warn(
                 f"{what} changes at {_listed(between)} h, within a step of {dt:g} h. A step takes"
                 " one value, so that values hold for longer or shorter than they should. Let the"
-                " times, and the period, be multiples of dt."
+                f" times, and the period, be multiples of dt{self._fitting(dt)}."
             )
+
+    def _fitting(self, dt: float) -> str:
+        """A step up to dt of which all times are multiples, in words; "" where there is none with
+        few digits."""
+        given = [Fraction(t).limit_denominator(10**6) for t in (*self.times, self.period or 0.0)]
+        whole = math.lcm(*(t.denominator for t in given))
+        common = Fraction(math.gcd(*(int(t * whole) for t in given)), whole)
+        least = max(1, math.ceil(float(common) / dt - ROUNDING))
+        steps = (common / count for count in range(least, least + 1000))
+        short = next((x for x in steps if 10_000 % x.denominator == 0), None)
+        return "" if short is None else f", such as of {float(short):g} h"
 
     def _lost(self, dt: float) -> list[float]:
         """The times whose values no step of the first period takes, or of as long as it changes."""
