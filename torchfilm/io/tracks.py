@@ -224,7 +224,7 @@ def _parents(given: tables.Table, column: str, cell: np.ndarray) -> np.ndarray:
     where no cell is 0."""
     if column not in given.columns:
         raise given.missing(column, "Give the cell from which each descends, −1 of those of none.")
-    values = []
+    values, least = [], 0 if (cell == 0).any() else 1
     for row, text in enumerate(given.columns[column].tolist()):
         if text is None or text == "" or text != text:
             values.append(NONE)
@@ -236,7 +236,7 @@ def _parents(given: tables.Table, column: str, cell: np.ndarray) -> np.ndarray:
         if not abs(number) < MOST_CELLS or number != np.round(number):
             rule = "a whole number, or empty where it has no parent"
             raise InputError(f"{given.place(row)}, column {column!r}: {text!r} must be {rule}.")
-        values.append(int(number) if number > 0 or (number == 0 and (cell == 0).any()) else NONE)
+        values.append(int(number) if number >= least else NONE)
     return np.array(values, np.int64)
 
 
