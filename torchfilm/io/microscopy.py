@@ -56,15 +56,7 @@ class View:
     def seen(self, rods: Rods, raster: Raster) -> tuple[Rods, np.ndarray]:
         """The cells, and those images of them that reach into the raster, and in space into the
         section; and which cell each is."""
-        which = np.arange(len(rods.half))
-        spans = dict(zip("xy", raster.span, strict=True))
-        if self.z is not None:
-            spans["z"] = self.z, self.z
-        for axis in spans.keys() & self.faces.keys():
-            low, high = self.faces[axis]
-            rods, more = rods.repeated("xyz".index(axis), high - low, spans[axis])
-            which = which[more]
-        return rods, which
+        return rods.seen(self.faces, raster, self.z)
 
 
 def view_of(
@@ -93,7 +85,7 @@ def view_of(
     tables = Tables(results, lineage, internals=True)
     faces = results.periodic if images else {}
     empty = View(results, own, chosen, Raster(pixel, 0.0, 0.0, (0, 0)), z, tables, faces)
-    (left, bottom), (right, top) = _corners(empty) if window is None else _checked(window)
+    (left, bottom), (right, top) = _corners(empty) if window is None else checked_window(window)
     if z is not None:
         _check_height(empty, z)
     rows, columns = (top - bottom) / pixel, (right - left) / pixel
@@ -125,7 +117,8 @@ def _check_height(view: View, z: float) -> None:
         raise checks.input_error("z", z, rule)
 
 
-def _checked(window: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def checked_window(window: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """The lower left and the upper right corner of a window, µm. Raises InputError for others."""
     if not isinstance(window, (tuple, list)) or len(window) != 2:
         raise checks.input_error(
             "window", window, "two corners, µm, such as ((-20, -20), (20, 20))"

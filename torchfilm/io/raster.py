@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,6 +49,22 @@ class Rods:
     def reach(self) -> np.ndarray:
         """(N, 2) how far each cell reaches from its centre along x and y, µm."""
         return np.abs(self.axis[:, :2]) * self.half[:, None] + self.radius[:, None]
+
+    def seen(
+        self, faces: Mapping[str, tuple[float, float]], raster: Raster, z: float | None
+    ) -> tuple[Rods, np.ndarray]:
+        """The cells, and those images of them beyond the faces of a periodic space that reach into
+        the raster, and into the section at the height z where it has one; and which cell each
+        is."""
+        rods, which = self, np.arange(len(self.half))
+        spans = dict(zip("xy", raster.span, strict=True))
+        if z is not None:
+            spans["z"] = z, z
+        for axis in sorted(spans.keys() & faces.keys()):
+            low, high = faces[axis]
+            rods, more = rods.repeated("xyz".index(axis), high - low, spans[axis])
+            which = which[more]
+        return rods, which
 
     def repeated(self, k: int, period: float, span: tuple[float, float]) -> tuple[Rods, np.ndarray]:
         """The cells, and their images every `period` µm along axis k that reach into a span; and

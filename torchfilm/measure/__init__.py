@@ -5,6 +5,7 @@ from torchfilm.film_shape import Film
 from torchfilm.measure.change import displacement, growth_rates
 from torchfilm.measure.forces import Overlap, WallForces, overlaps, pressure, wall_forces
 from torchfilm.measure.hull import Hull, hull
+from torchfilm.measure.images import image, labels
 from torchfilm.measure.mixing import alike_neighbours, clusters, heterozygosity, strains
 from torchfilm.measure.shape import (
     aspect_ratio,
@@ -36,6 +37,8 @@ __all__ = [
     "growth_rates",
     "heterozygosity",
     "hull",
+    "image",
+    "labels",
     "moran",
     "neighbours",
     "nematic_order",
