@@ -37,7 +37,7 @@ def scene_of(dim: int, law: str, contacts: dict, rate: object = 1.0) -> tf.Scene
 
 def one_by_one(model: tf.Model, state: tf.State, dt: float) -> tf.State:
     """A step without anything joined."""
-    state = model.opened(state)
+    state = model.opened(state, dt)
     for effect in model.effects:
         state = effect.run_step(state, dt)
     return tf.model.advanced(state, dt)
