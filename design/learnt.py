@@ -66,7 +66,7 @@ class LearntNetworks:
                     group = file.create_group(f"{GROUP}/{word}")
                     for name, value in weights.items():
                         group.create_dataset(name, data=value)
-        except tf.SimulationError as error:
+        except (tf.SimulationError, tf.InputError) as error:
             checks.warn(f"what was learnt is not kept: {error}")
             return
         self.new.clear()
@@ -77,6 +77,10 @@ def _read(path: Path | None) -> dict[str, Weights]:
     file of another kind."""
     if path is None or not path.exists():
         return {}
-    with reading(path, FORMAT, VERSION, "file of networks") as file:
-        groups = file.get(GROUP, {})
-        return {word: {name: x[...] for name, x in group.items()} for word, group in groups.items()}
+    try:
+        with reading(path, FORMAT, VERSION, "file of networks") as file:
+            groups = file.get(GROUP, {}).items()
+            return {word: {name: x[...] for name, x in group.items()} for word, group in groups}
+    except tf.InputError as error:
+        hint = "It keeps what can be learnt again: move it away, or delete it."
+        raise tf.InputError(f"{error} {hint}") from error

@@ -181,6 +181,33 @@ def test_a_detached_state_still_tells_of_them(tmp_path):
     assert sorted(lineage.colony[(lineage.parent < 0) & (lineage.born == 0.5)]) == [0, 0, 1]
 
 
+def test_what_came_and_went_before_a_resume_has_never_lived(tmp_path):
+    scene, path = scene_of(), tmp_path / "a.h5"
+    model = scene.bind(2)
+    for _ in tf.simulate(scene, until=0.2, colonies=2, record=path):
+        pass
+    with tf.Results(path) as results:
+        state = model.add(results.state(scene), drop(), [0])
+    state = state.remove(state.uid == state.next_uid[state.colony] - 1, "removed")
+    record = tf.Recorder(path, scene, append=True)
+    *_, end = tf.simulate(scene, state, until=0.3, record=record)
+    with tf.Results(path) as results:
+        lineage = results.lineage()
+    assert (lineage.fate == "alive").sum() == end.cells
+    assert np.isclose(lineage.born, 0.2).sum() == 1
+
+
+@pytest.mark.parametrize("typed", [True, False])
+def test_they_are_as_the_first_cells_of_the_model(typed):
+    given = tf.Cells([[0.0, 0.0]], [1.0, 0.0], cell_type=[1] if typed else None)
+    other = tf.Cells([[0.0, 0.0]], [1.0, 0.0], cell_type=None if typed else [1])
+    scene = tf.Scene(tf.Growth(rate=1.0), founders=other, dim=2)
+    model = scene.bind(cells=given)
+    assert model.add(model.start(), given).cells == 2
+    with pytest.raises(tf.InputError, match="cell_type, as the founders are"):
+        model.add(model.start(), other)
+
+
 def test_a_file_that_begins_with_them_goes_on(tmp_path):
     scene, path = scene_of(), tmp_path / "a.h5"
     model = scene.bind(2)
@@ -195,14 +222,15 @@ def test_a_file_that_begins_with_them_goes_on(tmp_path):
     assert alike(end, grown(model, 6, state))
 
 
-def test_reports_and_births_stay_true():
+def test_reports_stay_and_births_are_past():
     model = scene_of().bind(2)
     state = model.start()
-    while not state.births or not bool((state.births[-1].first < state.counts[0]).any()):
+    while not state.births:
         state = model.step(state)
     after = model.add(state, drop(), [0])
-    uids = lambda s: [s.uid[rows].tolist() for b in s.births for rows in (b.first, b.second)]
-    assert uids(after) == uids(state) and after.reports == state.reports
+    assert after.births == () and after.reports == state.reports
+    few = state.remove(state.uid >= state.next_uid[state.colony] - 2, "removed")
+    assert model.add(few, drop(), [0]).cells == few.cells + 2
     with pytest.raises(tf.InputError, match="between two steps"):
         model.add(state.replace(span=(0.0, 0.1)), drop())
 

@@ -102,6 +102,7 @@ def test_cells_across_the_faces_are_seen_at_both():
     ("make", "said"),
     [
         (lambda s: tf.measure.image(s, "yfp", pixel_size=0.1, window=WINDOW), "'yfp'"),
+        (lambda s: tf.measure.image(s, [], pixel_size=0.1, window=WINDOW), "one or more"),
         (lambda s: tf.measure.image(s, "gfp", pixel_size=0.0, window=WINDOW), "pixel_size"),
         (lambda s: tf.measure.image(s, "gfp", pixel_size=1e-5, window=WINDOW), "at most"),
         (lambda s: tf.measure.image(s, "gfp", pixel_size=1.0, window=((1, 1), (0, 2))), "window"),

@@ -122,6 +122,8 @@ def test_morans_index():
     checker = torch.tensor([1.0, -1.0] * 3, dtype=torch.float64)
     assert float(tf.measure.moran(state, checker, 0.1)) == pytest.approx(-1.0)
     assert tf.measure.moran(state, torch.ones(6), 0.1).isnan()
+    many = state_of([[3.0 * (k % 50), 3.0 * (k // 50)] for k in range(200)])
+    assert tf.measure.moran(many, torch.full((200,), 0.1, dtype=torch.float64), 0.5).isnan()
     assert tf.measure.moran(state_of([[0.0, 0.0], [30.0, 0.0]]), "length", 0.1).isnan()
     with pytest.raises(tf.InputError, match=r"moran\(name\) = 'dark'"):
         tf.measure.moran(state, "dark", 0.1)
@@ -138,5 +140,6 @@ def test_morans_index_of_shuffled_cells_is_about_zero():
 def test_a_periodic_space_has_no_hull():
     faces = {"x": (-20.0, 20.0)}
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, periodic=faces))
-    with pytest.raises(tf.InputError, match="hull goes by places"):
-        tf.measure.hull(scene.bind().start())
+    for name in ("hull", "aspect_ratio"):
+        with pytest.raises(tf.InputError, match=f"{name} goes by places"):
+            getattr(tf.measure, name)(scene.bind().start())

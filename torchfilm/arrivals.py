@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -26,7 +25,7 @@ def with_arrivals(
     model.check(state)
     if state.span is not None:
         raise checks.InputError("add puts cells into a state between two steps, not within one.")
-    _check_cells(cells, state, typed=model.scene.founders.cell_type is not None)
+    _check_cells(cells, state, typed=model.begin.cells.cell_type is not None)
     places = _places(cells, state, colonies)
     if not places:
         return state
@@ -118,14 +117,9 @@ def _beside(state: State, come: State) -> State:
         else x
         for n, x in state.fields.items()
     }
-    place = torch.argsort(order)  # of each cell
-    births = tuple(
-        replace(b, first=place.index_select(0, b.first), second=place.index_select(0, b.second))
-        for b in state.births
-    )
     return state.replace(
         **{n: both(getattr(state, n), getattr(come, n)) for n in PER_CELL},
-        fields=fields, next_uid=state.next_uid + counts, births=births,
+        fields=fields, next_uid=state.next_uid + counts, births=(),
     )  # fmt: skip
 
 
@@ -139,8 +133,7 @@ def _with_first_values(model: Model, state: State, rows: Tensor, come: State) ->
                 "add(cells).extra", [*come.fields], f"with {name!r}, which the founders brought",
                 f"No effect gives it a first value: extra={{{name!r}: …}}.",
             )  # fmt: skip
-        # not as daughters of the last step
-        first = state.declared[name].start(state.replace(births=()), rows)
+        first = state.declared[name].start(state, rows)
         state = state.with_fields(**{name: state.fields[name].index_copy(0, rows, first)})
     return state
 

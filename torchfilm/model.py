@@ -56,7 +56,7 @@ class Model:
         self, scene: Scene, batch: BoundBatch, start: FirstCells, only: Collection[int] | None
     ):
         self.scene, self.batch, self.dt, self.dim = scene, batch, scene.dt, scene.dim
-        self._begin, self.seed, self.cells_given = start, start.seed, start.given is not None
+        self.begin, self.seed = start, start.seed
         late = any(e.divides_at_threshold for e in scene.effects)
         stage = DIVISION if late else FLAGGED_DIVISION
         binding = Binding(batch, scene.dt, scene.dim, scene.declared_by, stage)
@@ -80,7 +80,7 @@ class Model:
     def start(self, seed: int | None = None) -> State:
         """The first state: founders, all fields at their first values, grids laid. seed: of what is
         drawn; by default that of the model."""
-        begin = self._begin
+        begin = self.begin
         if seed is not None:
             seed = checks.integer("seed", seed, least=0, most=2**63 - 1)
             begin = replace(begin, seed=seed)
@@ -185,12 +185,12 @@ class Model:
         state: of a run that is to be continued, or None for the first state. Returns the state
         tried on, made ready.
         """
-        tried = self._laid(self._begin) if state is None else state
+        tried = self._laid(self.begin) if state is None else state
         for effect in self.effects:
             tried = effect.trace(tried)
         for effect in self.effects:  # now that it is known what rules write
             effect.check_others(self.effects)
-        self.twins = CpuTwins.of_model(self, self._begin, tried)
+        self.twins = CpuTwins.of_model(self, self.begin, tried)
         return tried
 
     # --- checks --------------------------------------------------------------------------
@@ -330,7 +330,7 @@ class Model:
     def growth_fingerprint(self) -> str:
         """A word that is equal for models that grow alike, and for no others."""
         recorded = [self.scene.effects[k] for k in self.recorded]
-        return digest(recorded, self._begin.given or self.scene.drawn_from, self.dim)
+        return digest(recorded, self.begin.given or self.scene.drawn_from, self.dim)
 
     @cached_property
     def why_not_replayable(self) -> str:

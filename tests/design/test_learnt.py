@@ -109,6 +109,16 @@ def test_a_network_is_kept_by_what_it_was_learnt_from(tmp_path):
     assert changed.weight.shape == (4, 2)
 
 
+def test_a_file_of_another_kind_may_be_deleted(tmp_path):
+    (tmp_path / "a.networks.h5").write_bytes(b"no HDF5")
+    with pytest.raises(tf.InputError, match=r"learnt again: move it away, or delete it"):
+        LearntNetworks.beside(tmp_path / "a.h5")
+    learnt = LearntNetworks(tmp_path / "a.networks.h5")
+    learnt.network(1, lambda: nn.Linear(1, 1), lambda: nn.Linear(1, 1))
+    with pytest.warns(UserWarning, match="what was learnt is not kept"):
+        learnt.write()
+
+
 def test_networks_without_a_file_are_kept_for_now():
     learnt = LearntNetworks.beside(None)
     learnt.network(1, lambda: nn.Linear(1, 1), lambda: nn.Linear(1, 1))

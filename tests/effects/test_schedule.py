@@ -373,6 +373,12 @@ def test_what_no_step_of_a_medium_begins_with_is_lost(recwarn):
     tf.Schedule({0: 0.0, 0.14: 1.0, 0.25: 0.0}).warn_of_mean("dose", 0.1)
     tf.Schedule({t: torch.tensor([x, -x]) for t, x in ramp.items()}).warn_of_mean("dose", 0.1)
     assert not recwarn.list
+    long = tf.Schedule({k / 3600: float(k) for k in range(20_000)})
+    long.warn_of_mean("dose", 0.1)
+    assert not recwarn.list and long._fitting(0.1) == ""  # 1 s is far shorter
+    assert tf.Schedule({0: 0.0, 1 / 3: 1.0})._fitting(0.05) == ", such as of 0.04167 h"
+    for times in ({0: 0.0, 1e-7: 1.0}, {0: 0.0, 2.0000004: 1.0}, {0: 0.0}):
+        assert "0 h" not in tf.Schedule(times)._fitting(0.1)
     for peak in (
         tf.Schedule({**ramp, 0.2: 0.0}), tf.Schedule(ramp, period=0.2),
         tf.Schedule({0: 5.0, 0.01: 0.0}), tf.Schedule({0: {0: 5.0}, 0.01: {0: 0.0}}),

@@ -210,7 +210,7 @@ class Recorder(metaclass=checks.KnownKeywords):
         for name, value in self._attributes(state).items():
             self.file.attrs[name] = value
         create_tables(self.file, state)
-        own = self.model is None or not self.model.cells_given
+        own = self.model is None or self.model.begin.given is None
         write_parameters(self.file, self.scene, state.colony_id, state.step, by_founders=own)
         self.file.swmr_mode = True
         hold.enter_context(replacing.held(self.source))
@@ -243,7 +243,7 @@ class Recorder(metaclass=checks.KnownKeywords):
             self._check_resumed(kept, state)
             self.absent = events.absent_from(state, kept.frame(), kept.colony_id)
             come = events.just_arrived(state, kept.next_uid())
-            self.births += events.arrivals_of(come, state)
+            self.births += events.arrivals_of(come, state.replace(ended=()))
             self.written, self.first_step = int(kept.steps[-1]), int(kept.steps[0])
         check_room(
             self.target, self.target.stat().st_size, f"to resume {self.path}, by a copy of it",

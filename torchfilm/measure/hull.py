@@ -11,8 +11,8 @@ from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from torchfilm.measure.of_a_state import of_a_state
+from torchfilm.measure.shape import check_flat_space
 from torchfilm.state import State
-from torchfilm.tools import checks
 
 CORNERS = 64  # of a disc, where cells differ in their radius
 THIN = 1e-9  # across, relative to the extent, from which points are not on a line
@@ -38,8 +38,7 @@ def hull(state: State) -> Hull:
     and circularity, and how much of it cells fill, as programs of image analysis have them. Where
     cells differ in their radius, to a part of 1e-3 of it. Raises InputError in a space that is
     periodic along x or y."""
-    if state.space is not None and {"x", "y"} & {*state.space.faces}:
-        raise checks.InputError("hull goes by places, and this space is periodic along x or y.")
+    check_flat_space("hull", state)
     half = (0.5 * state.length.double()).unsqueeze(1) * state.axis[:, :2].double()
     place, radius = state.position[:, :2].double(), state.radius.double()
     ends = torch.stack([place - half, place + half], 1).cpu().numpy()

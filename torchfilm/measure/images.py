@@ -38,7 +38,9 @@ def image(
     noise. Raises InputError for what is no quantity, and for more than 2²⁸ pixels.
     """
     checks.choice("image(profile)", profile, PROFILES)
-    given = [names] if isinstance(names, str | Tensor) else list(names)
+    given = [names] if isinstance(names, str | Tensor) else list(names or ())
+    if not given:
+        raise checks.input_error("image(names)", names, "one or more quantities, such as 'gfp'")
     values = torch.stack([quantity("image", state, name) for name in given]).cpu().numpy()
     raster = _raster("image", pixel_size, window)
     pages = [
@@ -52,8 +54,8 @@ def image(
 @torch.no_grad()
 def labels(state: State, *, pixel_size: float, window: Window, z: float | None = None) -> Tensor:
     """Label masks of each colony from above, (B, rows, columns) int64: a cell's uid plus 1 where it
-    covers the centre of a pixel, 0 where none does; where two overlap, the one whose centreline is
-    nearer. pixel_size, window: as for `image`. z: in space, the height of the section, µm."""
+    covers the centre of a pixel, 0 where none does; where two overlap, the one in which it lies
+    deeper. pixel_size, window: as for `image`. z: in space, the height of the section, µm."""
     if (z is None) != (state.dim == 2):
         rule = "left out in the plane" if state.dim == 2 else "the height of the section, µm"
         raise checks.input_error("labels(z)", z, rule)

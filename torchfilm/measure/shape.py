@@ -34,11 +34,20 @@ def colony_radius(state: State) -> Tensor:
     return torch.where(state.counts == 0, torch.nan, safe_sqrt(mean))
 
 
+def check_flat_space(measure: str, state: State) -> None:
+    """Raise InputError where a colony may go on beyond a face along x or y."""
+    if state.space is not None and {"x", "y"} & {*state.space.faces}:
+        text = f"{measure} goes by places, and this space is periodic along x or y."
+        raise checks.InputError(text)
+
+
 @of_a_state
 def aspect_ratio(state: State) -> Tensor:
     """The long over the short axis of each colony as seen from above, (B,) float64: of the ellipse
     with the second moments of the area of its cells, caps included, as programs of image analysis
-    have it. 1 for a disc; NaN for a colony without cells."""
+    have it. 1 for a disc; NaN for a colony without cells. Raises InputError in a space that is
+    periodic along x or y."""
+    check_flat_space("aspect_ratio", state)
     flat = state.axis[:, :2].double()
     along_floor = safe_norm(flat.T)
     size, along, across = moments_of_capsule(

@@ -15,6 +15,8 @@ from torchfilm.tools.ragged import Groups
 from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.vectors import safe_norm
 
+EQUAL = 1e-28  # a variance, relative to the mean square, that roundings make
+
 
 @of_a_state
 def profile(
@@ -69,7 +71,9 @@ def moran(state: State, name: str | Tensor, gap: float) -> Tensor:
     together = apart.index_select(0, first) * apart.index_select(0, second)
     variance = state.groups.sum(apart * apart) / state.counts
     found = pairs.sum(together) / pairs.counts / variance
-    return torch.where(variance > 0, found, torch.nan)
+    # the mean of equal numbers is rounded
+    square = state.groups.sum(value * value) / state.counts
+    return torch.where(variance > EQUAL * square, found, torch.nan)
 
 
 @of_a_state

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import cached_property
 from numbers import Real
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from torchfilm.tools import checks
@@ -145,8 +143,12 @@ class Schedule(metaclass=checks.KnownKeywords):
     def warn_of_mean(self, what: str, dt: float) -> None:
         """Warn where a value of `what` holds for less than a step of dt hours, and so never in a
         whole one."""
-        for k, (time, length) in enumerate(zip(self.times, self._lengths, strict=True)):
-            if length < dt * (1 - 1e-6) and not self._between(k, dt):
+        lengths, ramp = self._lengths, self._on_ramps()
+        for k, (time, length) in enumerate(zip(self.times, lengths, strict=True)):
+            if length >= dt * (1 - 1e-6):
+                continue
+            first = k == 0 and self.period is None  # of several that are as short
+            if not (ramp[k] and (not first or lengths[1] < dt)):
                 warn(
                     f"{what} has the value of {time:g} h for {length:.3g} h, less than a step of"
                     f" {dt:g} h. Steps take the mean over their time: the dose is right, but what"
@@ -154,17 +156,17 @@ class Schedule(metaclass=checks.KnownKeywords):
                 )
                 return
 
-    def _between(self, place: int, dt: float) -> bool:
-        """Whether a value that holds for less than a step is between those before and after it, as
-        of a ramp; or the first of several that do."""
-        held = [torch.as_tensor(x) for x in self.values.values() if _is_number(x)]
-        if len(held) < len(self.values):
-            return False
-        before, after = held[place - 1], held[(place + 1) % len(held)]
-        if place == 0 and self.period is None:
-            return self._lengths[1] < dt
-        low, high = torch.minimum(before, after), torch.maximum(before, after)
-        return bool(((low <= held[place]) & (held[place] <= high)).all())
+    def _on_ramps(self) -> np.ndarray:
+        """Which values are between those before and after them, as of a ramp, (K,) bool; the first
+        is, unless values begin again. None where they have cell types."""
+        try:
+            each = [np.asarray(x, dtype=np.float64) for x in _plain(self.values.values())]
+            held = np.stack(np.broadcast_arrays(*each)).reshape(len(each), -1)
+        except (TypeError, ValueError):
+            return np.zeros(len(self.values), dtype=bool)
+        before, after = np.roll(held, 1, 0), np.roll(held, -1, 0)
+        found = (np.minimum(before, after) <= held) & (held <= np.maximum(before, after))
+        return found.all(1) | ((np.arange(len(held)) == 0) & (self.period is None))
 
     def warn_of_step(self, what: str, dt: float) -> None:
         """Warn where steps of dt hours, each with the value that holds as it begins, do not follow
@@ -188,13 +190,18 @@ class Schedule(metaclass=checks.KnownKeywords):
     def _fitting(self, dt: float) -> str:
         """A step up to dt of which all times are multiples, in words; "" where there is none with
         few digits."""
-        given = [Fraction(t).limit_denominator(10**6) for t in (*self.times, self.period or 0.0)]
-        whole = math.lcm(*(t.denominator for t in given))
-        common = Fraction(math.gcd(*(int(t * whole) for t in given)), whole)
-        least = max(1, math.ceil(float(common) / dt - ROUNDING))
-        steps = (common / count for count in range(least, least + 1000))
-        short = next((x for x in steps if 10_000 % x.denominator == 0), None)
-        return "" if short is None else f", such as of {float(short):g} h"
+        moments = np.array([*self.times, self.period or 0.0])
+        # in units of 1e-4 h, 1/3600 h and so on
+        for unit in (10_000, 3600):
+            ticks = np.round(moments * unit)
+            if np.abs(moments * unit - ticks).max() > 1e-6 or ticks.max() > 2**52:
+                continue
+            common = math.gcd(*(int(x) for x in ticks))
+            most = min(common, int(dt * unit + 1e-6))
+            fits = [n for n in range(1, most + 1) if common % n == 0]
+            if fits and fits[-1] / unit >= dt / 50:
+                return f", such as of {fits[-1] / unit:.4g} h"
+        return ""
 
     def _lost(self, dt: float) -> list[float]:
         """The times whose values no step of the first period takes, or of as long as it changes."""
@@ -213,9 +220,9 @@ class Schedule(metaclass=checks.KnownKeywords):
         return f"changes at {times} h{again}" if times else "stays as it is"
 
 
-def _is_number(value: Any) -> bool:
-    """Whether it is a number, or one per colony, without cell types."""
-    return isinstance(value, Real | np.ndarray | Tensor | list)
+def _plain(values: Iterable[Any]) -> list[Any]:
+    """Tensors as arrays, without their gradients."""
+    return [x.detach().cpu().numpy() if isinstance(x, Tensor) else x for x in values]
 
 
 def _listed(times: Sequence[float]) -> str:
