@@ -154,9 +154,7 @@ def _moved(state: State, move: Callable[[Any], Any], declared: Mapping[str, Fiel
             return Births(*(mapped(getattr(part, f.name), change) for f in fields(part)))
         return move(part) if isinstance(part, Tensor) else part
 
-    happened = {
-        n: mapped(getattr(state, n), change) for n in ("births", "ended", "arrived", "reports")
-    }
+    happened = {n: mapped(getattr(state, n), change) for n in ("births", "ended", "reports")}
     return state.moved(move).replace(declared=declared, **happened)
 
 

@@ -34,7 +34,7 @@ def arrivals_of(come: Sequence[Arrived], state: State) -> list[Rows]:
     found: list[Rows] = []
     if not come:
         return found
-    there = _keys([(state.own_colony_id, state.uid), *((e.colony_id, e.uid) for e in state.ended)])
+    there = _there_in_step(state)
     for a in come:
         own = zip(a.colony_id.tolist(), a.uid.tolist(), strict=True)
         kept = torch.tensor([key in there for key in own], dtype=torch.bool)
@@ -82,7 +82,7 @@ def removed_before(state: State, before: State) -> list[Ended]:
     come = sum(len(uid) for _, uid, *_ in arrivals_of(arrived_since(before, state), state))
     if state.cells == before.cells + born + come - ended:
         return []
-    there = _keys([(state.own_colony_id, state.uid), *((e.colony_id, e.uid) for e in state.ended)])
+    there = _there_in_step(state)
     own = zip(before.own_colony_id.tolist(), before.uid.tolist(), strict=True)
     gone = torch.tensor([key not in there for key in own], device=before.device)
     return [before.noted_end(torch.nonzero(gone).squeeze(1), "removed")]
@@ -105,6 +105,11 @@ def absent_from(state: State, frame: Mapping[str, np.ndarray], ids: np.ndarray) 
             "removed", colony, uid, length, None if kind is None else torch.from_numpy(kind[gone])
         )
     ]
+
+
+def _there_in_step(state: State) -> set[tuple[int, int]]:
+    """The cells of a state, and those that ended in its step, by colony id and number."""
+    return _keys([(state.own_colony_id, state.uid), *((e.colony_id, e.uid) for e in state.ended)])
 
 
 def _keys(parts: Iterable[tuple[Tensor, Tensor]]) -> set[tuple[int, int]]:

@@ -85,17 +85,23 @@ def view_of(
     tables = Tables(results, lineage, internals=True)
     faces = results.periodic if images else {}
     empty = View(results, own, chosen, Raster(pixel, 0.0, 0.0, (0, 0)), z, tables, faces)
-    (left, bottom), (right, top) = _corners(empty) if window is None else checked_window(window)
+    corners = _corners(empty) if window is None else checked_window(window)
     if z is not None:
         _check_height(empty, z)
+    return View(results, own, chosen, raster_of(pixel, corners), z, tables, faces)
+
+
+def raster_of(pixel: float, corners: tuple[Sequence[float], Sequence[float]]) -> Raster:
+    """The pixels, so wide in µm, between the lower left and the upper right corner. Raises
+    InputError for too many."""
+    (left, bottom), (right, top) = corners
     rows, columns = (top - bottom) / pixel, (right - left) / pixel
     if rows * columns > MOST_PIXELS:
         rule = (
             f"so large that a page has at most {MOST_PIXELS} pixels, not {rows:.0f} × {columns:.0f}"
         )
         raise checks.input_error("pixel_size", pixel, rule, "Or give a smaller window.")
-    shape = max(1, round(rows)), max(1, round(columns))
-    return View(results, own, chosen, Raster(pixel, left, top, shape), z, tables, faces)
+    return Raster(pixel, left, top, (max(1, round(rows)), max(1, round(columns))))
 
 
 def _check_height(view: View, z: float) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.io.microscopy import MOST_PIXELS, PROFILES, checked_window
+from torchfilm.io.microscopy import PROFILES, checked_window, raster_of
 from torchfilm.io.raster import Raster, Rods, label_image, thickness_image
 from torchfilm.measure.of_a_state import of_a_state
 from torchfilm.spatial import quantity
@@ -69,12 +69,7 @@ def labels(state: State, *, pixel_size: float, window: Window, z: float | None =
 
 def _raster(measure: str, pixel_size: float, window: Window) -> Raster:
     pixel = checks.number(f"{measure}(pixel_size)", pixel_size, above=0.0, hint="In µm.")
-    (left, bottom), (right, top) = checked_window(window)
-    shape = max(1, round((top - bottom) / pixel)), max(1, round((right - left) / pixel))
-    if shape[0] * shape[1] > MOST_PIXELS:
-        rule = f"so large that an image has at most {MOST_PIXELS} pixels"
-        raise checks.input_error(f"{measure}(pixel_size)", pixel, rule)
-    return Raster(pixel, left, top, shape)
+    return raster_of(pixel, checked_window(window))
 
 
 def _colonies(state: State, raster: Raster, z: float | None) -> list[tuple[Rods, np.ndarray]]:

@@ -112,6 +112,11 @@ class Schedule(metaclass=checks.KnownKeywords):
         return [(k, x / hours) for k, x in held] if len(held) > 1 else [(held[0][0], 1.0)]
 
     @property
+    def _moments(self) -> tuple[float, ...]:
+        """The times that a step should not span, h."""
+        return (*self.times, self.period or 0.0)
+
+    @property
     def _lengths(self) -> list[float]:
         """How long each value holds, h; the last one until the period ends, or for ever."""
         ends = (*self.times[1:], math.inf if self.period is None else self.period)
@@ -144,11 +149,10 @@ class Schedule(metaclass=checks.KnownKeywords):
         """Warn where a value of `what` holds for less than a step of dt hours, and so never in a
         whole one."""
         lengths, ramp = self._lengths, self._on_ramps()
-        for k, (time, length) in enumerate(zip(self.times, lengths, strict=True)):
-            if length >= dt * (1 - 1e-6):
-                continue
-            first = k == 0 and self.period is None  # of several that are as short
-            if not (ramp[k] and (not first or lengths[1] < dt)):
+        if self.period is None and len(lengths) > 1:  # of a ramp more than one is short
+            ramp[0] &= lengths[1] < dt
+        for time, length, on_ramp in zip(self.times, lengths, ramp, strict=True):
+            if length < dt * (1 - 1e-6) and not on_ramp:
                 warn(
                     f"{what} has the value of {time:g} h for {length:.3g} h, less than a step of"
                     f" {dt:g} h. Steps take the mean over their time: the dose is right, but what"
@@ -158,7 +162,7 @@ class Schedule(metaclass=checks.KnownKeywords):
 
     def _on_ramps(self) -> np.ndarray:
         """Which values are between those before and after them, as of a ramp, (K,) bool; the first
-        is, unless values begin again. None where they have cell types."""
+        is, unless values begin again. None of them is where they have cell types."""
         try:
             each = [np.asarray(x, dtype=np.float64) for x in _plain(self.values.values())]
             held = np.stack(np.broadcast_arrays(*each)).reshape(len(each), -1)
@@ -178,8 +182,7 @@ class Schedule(metaclass=checks.KnownKeywords):
                 f" multiples{self._fitting(dt)}."
             )
             return
-        moments = (*self.times, self.period or 0.0)
-        between = [t for t in moments if abs(t / dt - round(t / dt)) > 1e-6]
+        between = [t for t in self._moments if abs(t / dt - round(t / dt)) > 1e-6]
         if between:
             warn(
                 f"{what} changes at {_listed(between)} h, within a step of {dt:g} h. A step takes"
@@ -190,8 +193,8 @@ class Schedule(metaclass=checks.KnownKeywords):
     def _fitting(self, dt: float) -> str:
         """A step up to dt of which all times are multiples, in words; "" where there is none with
         few digits."""
-        moments = np.array([*self.times, self.period or 0.0])
-        # in units of 1e-4 h, 1/3600 h and so on
+        moments = np.array(self._moments)
+        # in whole numbers of 1e-4 h, or of seconds
         for unit in (10_000, 3600):
             ticks = np.round(moments * unit)
             if np.abs(moments * unit - ticks).max() > 1e-6 or ticks.max() > 2**52:
