@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import torchfilm as tf
+from torchfilm.signals.schedule import held_together
 
 F64 = {"dtype": torch.float64}
 
@@ -18,23 +19,25 @@ def summed(u, s, p, cell):
 @pytest.mark.parametrize(("begin", "end"), [(1.02, 1.38), (1.1, 1.4), (1.05, 2.0), (0.0, 0.96)])
 @pytest.mark.parametrize("backend", ["compiled", "torch"])
 def test_pulses_that_end_within_steps_give_their_dose(begin, end, backend):
-    """To circuits, to rules and to reactions in the medium; in parts that begin anywhere, too."""
+    """To circuits, rules, and reactions and sources of the medium; in parts that begin anywhere,
+    too."""
     light = tf.Schedule({0: 0.0, begin: 1.0, end: 0.0} if begin else {0: 1.0, end: 0.0})
 
     def see(cells):
         cells.seen = cells.seen + cells.dt * cells.p.light
 
     box = {"box": ((-9, -9), (9, 9)), "spacing": 3.0, "depth": 1.0}
+    fed = tf.Signal(diffusion=1.0, source=light)
     scene = tf.Scene(
         tf.Circuit(summed, species="dye", light=light, dilution=False, backend=backend),
         tf.Rules(see, variables={"seen": 0.0}, parameters={"light": light}),
-        tf.Medium(a=tf.Signal(diffusion=1.0), **box),
+        tf.Medium(a=tf.Signal(diffusion=1.0), b=fed, **box, backend=backend),
         tf.MediumReactions(lambda s, p: {"a": p.light + 0.0 * s.a}, parameters={"light": light}),
         dim=2,
     )  # fmt: skip
     *_, first = tf.simulate(scene.bind(**F64), until=0.05, dt=0.05)
     *_, last = tf.simulate(scene, first, until=2.25, dt=0.1)
-    for found in (last.dye, last.seen, last.signals["a"][0]):
+    for found in (last.dye, last.seen, last.signals["a"][0], last.signals["b"][0]):
         assert float(found) == pytest.approx(end - begin, rel=1e-6)
 
 
@@ -67,3 +70,107 @@ def test_a_restart_within_a_pulse_and_derivatives_by_it():
     assert state.span is None and state.dye.tolist() == pytest.approx([0.47, 1.41])
     (slope,) = torch.autograd.grad(state.dye.sum(), strength)
     assert slope.tolist() == pytest.approx([0.47, 0.47])
+
+
+OPEN = tf.BoundaryConditions(x=(tf.Open(1.0), tf.Open()), y=tf.Periodic())
+PLACES = {
+    "face": lambda x: {"boundary": tf.BoundaryConditions(x=(tf.Dirichlet(x), tf.NoFlux()))},
+    "flux": lambda x: {"boundary": tf.BoundaryConditions(x=(tf.Flux(x), tf.Robin(0.0, 9.0)))},
+    "wash": lambda x: {"flow": (60.0, 0.0), "boundary": tf.BoundaryConditions(x=tf.Open(x))},
+    "flow": lambda x: {"flow": _each(lambda v: (40.0 * v, 10.0), x), "boundary": OPEN},
+    "swirl": lambda x: {
+        "flow": _each(lambda v: lambda at: torch.stack([0 * at[:, 0] + 40.0 * v, at[:, 0]], 1), x),
+        "boundary": OPEN,
+    },
+}
+
+
+def _each(make, given):
+    if not isinstance(given, tf.Schedule):
+        return make(given)
+    return tf.Schedule({t: make(x) for t, x in given.values.items()}, given.period)
+
+
+def _fed(where, value, **more):
+    """The food of a medium that a value, or a schedule of them, feeds or moves."""
+    box = {"box": ((-12, -12), (12, 12)), "spacing": 4.0, "depth": 1.0}
+    food = tf.Signal(diffusion=500.0, initial=0.2, decay=0.1)
+    eats = tf.Monod("food", rate=1.0, half=0.5) if more.pop("eats", False) else tf.Growth()
+    return tf.Scene(
+        eats, *([tf.Growth()] if isinstance(eats, tf.Monod) else []), tf.Mechanics(dim=2),
+        tf.Medium(food=food, **PLACES[where](value), **box, **more),
+    )  # fmt: skip
+
+
+def _food(scene, dt, until=0.6):
+    *_, last = tf.simulate(scene.bind(**F64), until=until, dt=dt)
+    return last.signals["food"]
+
+
+@pytest.mark.filterwarnings("ignore:no effect|.*writes|.*reads:UserWarning")
+@pytest.mark.parametrize("eats", [False, True])
+@pytest.mark.parametrize("where", PLACES)
+def test_a_medium_meets_the_mean_of_what_changes_within_a_step(where, eats):
+    """Steps of 0.05 h, as steps of 1/600 h at whose beginnings the values change."""
+    pulse = tf.Schedule({0: 0.0, 0.115: 1.0, 0.365: 0.25})
+    exact = _food(_fed(where, pulse, eats=eats), 1 / 600)
+    found = _food(_fed(where, pulse, eats=eats), 0.05)
+    early, late = (
+        _food(_fed(where, tf.Schedule({0: 0.0, 0.1 + x: 1.0, 0.35 + x: 0.25}), eats=eats), 0.05)
+        for x in (0.0, 0.05)
+    )
+    error = (found - exact).abs().max()
+    assert error < 0.15 * (early - late).abs().max()
+
+
+def test_what_changes_in_one_step_is_held_together():
+    """A flow that comes as the food at its face goes carries none in."""
+    low, high = {0: 0.0, 0.12: 1.0}, {0: 1.0, 0.12: 0.0}
+    held = held_together([tf.Schedule(low), tf.Schedule(high)], 0.1, 0.15)
+    assert held == {(0, 0): (0.4, pytest.approx(0.11)), (1, 1): (0.6, pytest.approx(0.135))}
+    apart = held_together([tf.Schedule(low), tf.Schedule({0: 1.0, 0.13: 0.0})], 0.1, 0.15)
+    shares = {places: share for places, (share, _) in apart.items()}
+    assert shares == {(0, 0): 0.4, (1, 0): 0.2, (1, 1): 0.4}
+    again = tf.Schedule({0: 1.0, 0.01: 2.0}, period=0.02)
+    twice = {k: share for k, (share, _) in held_together([again] * 2, 0.0, 0.06).items()}
+    assert twice == {(0, 0): 0.5, (1, 1): 0.5}
+
+    faces = tf.BoundaryConditions(x=(tf.Open(tf.Schedule(high)), tf.Open()), y=tf.Periodic())
+    flow = tf.Schedule({t: (40.0 * x, 0.0) for t, x in low.items()})
+    box = {"box": ((-12, -12), (12, 12)), "spacing": 4.0, "depth": 1.0}
+    food = tf.Signal(diffusion=50.0)
+    scene = tf.Scene(tf.Medium(food=food, flow=flow, boundary=faces, **box), dim=2)
+    assert float(_food(scene, 0.05, 0.5).max()) == 0.0
+
+
+def test_a_reservoir_has_its_mean_for_each_colony():
+    """Cells that reach beyond the box find what lies there."""
+    beyond = tf.Schedule({0: 0.0, 1.02: tf.PerColony([1.0, 3.0]), 1.04: 0.0})
+
+    def find(cells):
+        cells.found = cells.found + cells.signals["food"] * cells.dt
+
+    scene = tf.Scene(
+        tf.Rules(find, variables={"found": 0.0}),
+        tf.Medium(
+            food=tf.Signal(diffusion=1.0, reservoir=beyond), box=((-9, -9), (9, 9)), spacing=3.0,
+            outside="reservoir",
+        ),
+        founders=tf.Cells([[50.0, 0.0]], [[1.0, 0.0]]), dim=2,
+    )  # fmt: skip
+    with pytest.warns(UserWarning, match="reservoir of food has the value of 1.02 h for 0.02 h"):
+        *_, last = tf.simulate(scene.bind(colonies=2, **F64), until=2.0, dt=0.1)
+    assert last.found.tolist() == pytest.approx([0.02, 0.06], rel=1e-6)
+
+
+def test_a_periodic_schedule_prepares_the_steps_of_one_period():
+    """Whatever rounding makes of its edges."""
+    food = tf.Signal(diffusion=50.0, source=tf.Schedule({0: 1.0, 0.13: 0.0}, period=0.35))
+    box = {"box": ((-12, -12), (12, 12)), "spacing": 4.0, "depth": 1.0}
+    model = tf.Scene(tf.Medium(food=food, **box), dim=2).bind()
+    state = model.start()
+    for _ in range(7 * 40):
+        state = model.step(state, 0.05)
+    (transport,) = {e.transport for e in model.effects if hasattr(e, "transport")}
+    (known,) = transport.carriers.values()
+    assert len(known) == 3  # 1, a mean, and 0

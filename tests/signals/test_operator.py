@@ -16,7 +16,7 @@ from torchfilm.signals.boundary_conditions import (
     Periodic,
 )
 from torchfilm.signals.transport_iterative import convolve
-from torchfilm.signals.transport_operator import Operator, apply
+from torchfilm.signals.transport_operator import Operator, apply, mean
 from torchfilm.signals.transport_rates import build_operator, fitted_rates
 from torchfilm.tools.checks import InputError
 
@@ -382,3 +382,34 @@ def test_one_periodic_face_has_one_velocity():
             velocity=velocity,
             boundary=BoundaryConditions(x=Periodic()),
         )
+
+
+@pytest.mark.parametrize(
+    ("kinds", "masked"),
+    [
+        (("uniform", "still"), False),
+        (("uniform", "still"), True),
+        (("uniform", "varying"), False),
+        (("varying", "varying"), True),
+    ],
+)
+@pytest.mark.parametrize("faces", [("mixed", "mixed"), ("open", "closed")])
+def test_a_mean_operator_has_the_mean_rates(faces, kinds, masked):
+    """Of values whatever they are, with what enters through faces; and where no source is."""
+    shape = (5, 4, 3)
+    one, other = (
+        operator_of(shape, face, kind, masked, source=source)[0]
+        for face, kind, source in zip(faces, kinds, (0.3, None), strict=True)
+    )
+    made = mean([(0.25, one), (0.75, other)])
+    u = torch.rand(2, *shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    for gain in (False, True):
+        expected = 0.25 * apply(one, u, gain=gain) + 0.75 * apply(other, u, gain=gain)
+        torch.testing.assert_close(apply(made, u, gain=gain), expected, rtol=1e-13, atol=1e-13)
+    assert (made.interior is None) == ("varying" in kinds) and not made.symmetric
+    if made.interior is not None:  # it is that of the faces between two voxels
+        for axis, rates in zip(made.axes, made.interior, strict=True):
+            among = axis.up.narrow(axis.dim, 1, 1), axis.down.narrow(axis.dim, 1, 1)
+            for found, rate in zip(among, rates, strict=True):
+                assert masked or torch.equal(found.flatten()[:1], rate.flatten()[:1])
+    assert mean([(1.0, one)]) is one

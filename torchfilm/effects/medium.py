@@ -249,7 +249,7 @@ class Medium(Effect):
 
     def check_step(self, dt: float, divides: bool) -> None:
         for what, schedule in self._scheduled().items():
-            schedule.warn_of_step(f"the Schedule of {what}", dt)
+            schedule.warn_of_mean(f"the Schedule of the {what}", dt)
 
     def _scheduled(self) -> dict[str, Schedule]:
         """The schedules, by what they are of."""

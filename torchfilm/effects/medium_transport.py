@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -20,9 +20,9 @@ from torchfilm.resolver import snapshot
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.grid import Grid, GridBatch
 from torchfilm.signals.layout import Layout
-from torchfilm.signals.schedule import at_time, each_value, schedules
+from torchfilm.signals.schedule import Schedule, at_time, each_value, held_together, schedules
 from torchfilm.signals.transport import Carrier, carry, check_method, choose, prepare
-from torchfilm.signals.transport_operator import Operator
+from torchfilm.signals.transport_operator import Operator, mean
 from torchfilm.signals.transport_rates import build_operator
 from torchfilm.signals.transport_series import FARTHEST, Series
 from torchfilm.signals.transport_uptake import UptakeTransport
@@ -39,6 +39,8 @@ from torchfilm.effects.signal import Flow, OnGrid, Signal
 # Methods that are exact over a step, whatever its length.
 EXACT = ("exponential", "series")
 MOST_KEPT = 128  # prepared steps of a grid
+# Which values of some schedules hold, by their places: each with a share of a step, and a time, h.
+Held = dict[tuple[int, ...], tuple[float, float]]
 
 
 def _keep(known: dict[Any, Any], key: Any, made: Any) -> None:
@@ -48,27 +50,28 @@ def _keep(known: dict[Any, Any], key: Any, made: Any) -> None:
     known[key] = made
 
 
+def _held(schedules: Sequence[Schedule], state: State) -> Held:
+    """What holds during a step; before one, at the time of a state."""
+    if not schedules:
+        return {(): (1.0, 0.0)}
+    if state.span is None:
+        return {tuple(x.place(state.time) for x in schedules): (1.0, state.time)}
+    return held_together(schedules, *state.span)
+
+
+def _key(held: Held) -> tuple[Any, ...]:
+    """By which a prepared step is known: the same values for the same shares of it."""
+    return tuple((places, share) for places, (share, _) in held.items())
+
+
 @dataclass(frozen=True, eq=False)
 class Constants:
     """What a medium is given, by the name of a signal, on the batch's device, while no schedule
-    goes on. place: of the value of each schedule."""
+    goes on."""
 
-    medium: Medium
-    place: tuple[int, ...]
     signals: dict[str, Signal]
     flows: dict[str, Flow]
     boundary: dict[str, BoundaryConditions]
-
-    @cached_property
-    def space(self) -> dict[str, Any]:
-        """What of a layout the scene decides, whatever grid a state has."""
-        reservoir = {name: s.reservoir for name, s in self.signals.items()}
-        return {
-            "periodic": self.boundary[next(iter(self.signals))].periodic,
-            "height": self.medium.height,
-            "obstacle": self.medium.obstacles,
-            "reservoir": reservoir if self.medium.outside == "reservoir" else None,
-        }
 
     def numbers(self, name: str) -> list[Any]:
         """The values that a signal's transport depends on; some are tensors."""
@@ -98,7 +101,9 @@ class Transport:
         # those that transport of each signal depends on; a reservoir is none of it
         self._moving = {n: schedules((x.source, flows[n], boundary[n])) for n, x in signals.items()}
         self.corner = medium.corners[0]
+        self._reservoirs = schedules([x.reservoir for x in signals.values()])
         self._known: dict[tuple[int, ...], Constants] = {}
+        self._spaces: dict[Any, dict[str, Any]] = {}
         # signals that take turns with circuits, in the medium's steps; that others move, by whom
         self.in_turns: frozenset[str] = frozenset()
         self.coupled: dict[str, str] = {}
@@ -116,21 +121,44 @@ class Transport:
             torch.tensor(self.medium.voxels, device=state.device).expand(size).clone(),
             step,
         )
-        return state.replace(layout=Layout(grid, **self.at(state.time).space))
+        return state.replace(layout=Layout(grid, **self._space(state)))
 
     def at(self, time: float) -> Constants:
         """What holds at a time, h."""
         place = tuple(x.place(time) for x in self.schedules)
         if place not in self._known:
             parts = at_time(self._given, time) if place else self._given
-            self._known[place] = Constants(self.medium, place, *parts)
+            self._known[place] = Constants(*parts)
         return self._known[place]
+
+    def _space(self, state: State) -> dict[str, Any]:
+        """What of a layout the scene decides, whatever grid a state has."""
+        held = _held(self._reservoirs, state)
+        key = _key(held)
+        if key not in self._spaces:
+            signals, medium = self._given[0], self.medium
+            beyond = {name: self._reservoir(name, held) for name in signals}
+            made = {
+                "periodic": self._given[2][next(iter(signals))].periodic,
+                "height": medium.height,
+                "obstacle": medium.obstacles,
+                "reservoir": beyond if medium.outside == "reservoir" else None,
+            }
+            _keep(self._spaces, key, made)
+        return self._spaces[key]
+
+    def _reservoir(self, name: str, held: Held) -> Any:
+        """The concentration beyond the box; over a step in which it changes, its mean."""
+        each: list[tuple[float, Any]] = [
+            (share, self.at(time).signals[name].reservoir) for share, time in held.values()
+        ]
+        return each[0][1] if len(each) == 1 else sum(share * x for share, x in each)
 
     def opened(self, state: State) -> State:
         """The state in the space of this medium, also where another model laid its grid."""
         layout = state.layout
         # the same layout where nothing differs: it keeps what it has found out about its grid
-        space = self.at(state.time).space
+        space = self._space(state)
         if layout is None or all(getattr(layout, n) is v for n, v in space.items()):
             return state
         return state.replace(layout=dataclasses.replace(layout, **space))
@@ -139,10 +167,9 @@ class Transport:
         """The first values of a signal, as a field's `initial`."""
         return partial(_first_values, self.at(0.0).signals[name].initial, name, self.corner)
 
-    def values(self, name: str, what: str, state: State) -> Tensor:
+    def values(self, now: Constants, name: str, what: str, state: State) -> Tensor:
         """The initial, source or decay of a signal on every voxel, (nodes,); 0 in obstacles."""
-        given = getattr(self.at(state.time).signals[name], what)
-        return on_grid(given, name, what, state, self.corner)
+        return on_grid(getattr(now.signals[name], what), name, what, state, self.corner)
 
     def without_cells(self, name: str, state: State, dt: float) -> Tensor:
         """What a signal has become on every voxel as cells are about to find it in a step of dt
@@ -186,7 +213,7 @@ class Transport:
         they stay."""
         assert state.layout is not None
         grid = state.layout.grid
-        key = (name, self._place(name, state), state.dtype, torch.is_grad_enabled())
+        key = (name, _key(self._held(name, state)), state.dtype, torch.is_grad_enabled())
         known = self._eaten.setdefault(grid, {})
         if key in known and not self._tracked(name, state):
             return known[key]
@@ -206,14 +233,15 @@ class Transport:
 
     def _tracked(self, name: str, state: State) -> bool:
         """Whether derivatives by what a signal's transport depends on are wanted."""
-        now = self.at(state.time)
-        numbers = [x for x in now.numbers(name) if isinstance(x, Tensor)]
-        return tracked(*numbers, *_closure_tensors(now.signals[name], now.flows[name]))
+        each = [self.at(time) for _, time in self._held(name, state).values()]
+        numbers = [x for now in each for x in now.numbers(name) if isinstance(x, Tensor)]
+        functions = [_closure_tensors(now.signals[name], now.flows[name]) for now in each]
+        return tracked(*numbers, *(x for found in functions for x in found))
 
     def carrier(self, name: str, state: State, batch: GridBatch, dt: float) -> Carrier:
         """The step of a signal on grids of one shape; it is reused while the grids stay."""
         assert state.layout is not None
-        place = self._place(name, state)
+        place = _key(self._held(name, state))
         if self._tracked(name, state):
             kept = {} if self._of_step is None else self._of_step
             own = (name, place, batch.shape, dt)
@@ -231,9 +259,9 @@ class Transport:
                 _keep(known, key, found)
         return found
 
-    def _place(self, name: str, state: State) -> tuple[int, ...]:
-        """Of the value that holds in each schedule by which a signal moves."""
-        return tuple(x.place(state.time) for x in self._moving[name])
+    def _held(self, name: str, state: State) -> Held:
+        """Which values of the schedules by which a signal moves hold in a step."""
+        return _held(self._moving[name], state)
 
     @contextmanager
     def one_step(self) -> Iterator[None]:
@@ -273,9 +301,10 @@ class Transport:
     def _check_fixed(self, name: str, state: State) -> None:
         """Raise InputError for a function of positions that draws random numbers."""
         for what in ("initial", "source", "decay"):
-            if not callable(getattr(self.at(state.time).signals[name], what)):
+            now = self.at(state.time)
+            if not callable(getattr(now.signals[name], what)):
                 continue
-            one, again = (self.values(name, what, state).detach() for _ in range(2))
+            one, again = (self.values(now, name, what, state).detach() for _ in range(2))
             # on a GPU, sums may differ by rounding from one call to the next
             near = 0.0 if state.device.type == "cpu" else 1e-5
             if not torch.allclose(one, again, rtol=near, atol=0.0):
@@ -316,15 +345,19 @@ class Transport:
         return Carrier(stepper, batch.shape, self.compiled and not wanted), wanted
 
     def _operator(self, name: str, state: State, batch: GridBatch) -> Operator:
-        now, layout = self.at(state.time), state.layout
-        signal = now.signals[name]
+        """The operator of a signal; in a step in which schedules change, the mean one."""
+        held = self._held(name, state).values()
+        return mean([(x, self._operator_at(self.at(t), name, state, batch)) for x, t in held])
+
+    def _operator_at(self, now: Constants, name: str, state: State, batch: GridBatch) -> Operator:
+        signal, layout = now.signals[name], state.layout
         assert layout is not None
         ids = state.colony_id.index_select(0, batch.colonies)
         own = lambda x: (
             x.to(state.device).index_select(0, ids) if isinstance(x, Tensor) and x.dim() == 1 else x
         )
         spread = lambda x: (
-            batch.of(self.values(name, x, state))
+            batch.of(self.values(now, name, x, state))
             if callable(getattr(signal, x))
             else own(getattr(signal, x))
         )

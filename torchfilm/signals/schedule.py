@@ -7,6 +7,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from numbers import Real
 from typing import Any
 
@@ -19,7 +20,6 @@ from torchfilm.tools.warn_once import warn
 
 # Hours, relative to the time: what times gather by rounding, far below any step.
 ROUNDING = 1e-9
-MOST_LOOKED_AT = 100_000  # steps, to see whether each value holds in one
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +32,10 @@ class Schedule(metaclass=checks.KnownKeywords):
     None: the last value stays, and the first holds before 0 h, too.
 
     Circuits, rules and `MediumReactions` take one as a constant, `p.light` of `Circuit(…,
-    light=schedule)`, and so do `Lysis`, `Erosion` and `Motility`: each step has the mean of what
-    holds during it, so that doses are exact whenever they begin and end. A medium takes one in
-    place of a source, a flow, a reservoir or the value at a face, with the value that holds as a
-    step begins. `schedule(time)` is the value at a time, `schedule.mean(begin, end)` the mean.
+    light=schedule)`, and so do `Lysis`, `Erosion` and `Motility`. A medium takes one in place of a
+    source, a flow, a reservoir or the value at a face. Each step has the mean of what holds during
+    it, so that doses are exact whenever they begin and end. `schedule(time)` is the value at a
+    time, `schedule.mean(begin, end)` the mean.
     """
 
     values: Mapping[float, Any]
@@ -112,11 +112,6 @@ class Schedule(metaclass=checks.KnownKeywords):
         return [(k, x / hours) for k, x in held] if len(held) > 1 else [(held[0][0], 1.0)]
 
     @property
-    def _moments(self) -> tuple[float, ...]:
-        """The times that a step should not span, h."""
-        return (*self.times, self.period or 0.0)
-
-    @property
     def _lengths(self) -> list[float]:
         """How long each value holds, h; the last one until the period ends, or for ever."""
         ends = (*self.times[1:], math.inf if self.period is None else self.period)
@@ -130,9 +125,16 @@ class Schedule(metaclass=checks.KnownKeywords):
         ends = (*self.times[1:], self.period)
         return after - after % self.period + ends[place]
 
+    def changes(self, begin: float, end: float) -> list[float]:
+        """When its values change between two times, h."""
+        found, near = [], ROUNDING * max(1.0, abs(end))
+        while (begin := self._next(begin, self.place(begin))) < end - near:
+            found.append(begin)
+        return found
+
     def mean(self, begin: float, end: float) -> Any:
         """The mean of its numbers, or tensors, from one time to another, h, as a step from `begin`
-        to `end` has it in a circuit. Raises InputError for an end that is not later."""
+        to `end` has it. Raises InputError for an end that is not later."""
         begin = checks.number("Schedule.mean(begin)", begin)
         end = checks.number("Schedule.mean(end)", end, above=begin)
         held = [np.array(x) if isinstance(x, list) else x for x in self.values.values()]
@@ -172,49 +174,6 @@ class Schedule(metaclass=checks.KnownKeywords):
         found = (np.minimum(before, after) <= held) & (held <= np.maximum(before, after))
         return found.all(1) | ((np.arange(len(held)) == 0) & (self.period is None))
 
-    def warn_of_step(self, what: str, dt: float) -> None:
-        """Warn where steps of dt hours, each with the value that holds as it begins, do not follow
-        the changes of `what`."""
-        if lost := self._lost(dt):
-            warn(
-                f"{what} has the value of {_listed(lost)} h in no step of"
-                f" {dt:g} h: it is lost. Take a shorter dt, of which the times are"
-                f" multiples{self._fitting(dt)}."
-            )
-            return
-        between = [t for t in self._moments if abs(t / dt - round(t / dt)) > 1e-6]
-        if between:
-            warn(
-                f"{what} changes at {_listed(between)} h, within a step of {dt:g} h. A step takes"
-                " one value, so that values hold for longer or shorter than they should. Let the"
-                f" times, and the period, be multiples of dt{self._fitting(dt)}."
-            )
-
-    def _fitting(self, dt: float) -> str:
-        """A step up to dt of which all times are multiples, in words; "" where there is none with
-        few digits."""
-        moments = np.array(self._moments)
-        # in whole numbers of 1e-4 h, or of seconds
-        for unit in (10_000, 3600):
-            ticks = np.round(moments * unit)
-            if np.abs(moments * unit - ticks).max() > 1e-6 or ticks.max() > 2**52:
-                continue
-            common = math.gcd(*(int(x) for x in ticks))
-            most = min(common, int(dt * unit + 1e-6))
-            fits = [n for n in range(1, most + 1) if common % n == 0]
-            if fits and fits[-1] / unit >= dt / 50:
-                return f", such as of {fits[-1] / unit:.4g} h"
-        return ""
-
-    def _lost(self, dt: float) -> list[float]:
-        """The times whose values no step of the first period takes, or of as long as it changes."""
-        end = self.times[-1] + 2 * dt if self.period is None else self.period
-        steps = int(end / dt + ROUNDING) + 1
-        if steps < len(self.times) or steps < MOST_LOOKED_AT:
-            seen = {self.place(k * dt) for k in range(steps)}
-            return [t for k, t in enumerate(self.times) if k not in seen]
-        return []
-
     @property
     def told(self) -> str:
         """When it changes, in words."""
@@ -226,11 +185,6 @@ class Schedule(metaclass=checks.KnownKeywords):
 def _plain(values: Iterable[Any]) -> list[Any]:
     """Tensors as arrays, without their gradients."""
     return [x.detach().cpu().numpy() if isinstance(x, Tensor) else x for x in values]
-
-
-def _listed(times: Sequence[float]) -> str:
-    """Some times, the first of many."""
-    return ", ".join(f"{t:g}" for t in times[:6]) + (", …" if len(times) > 6 else "")
 
 
 def warn_of_means(owner: str, values: Mapping[str, Any], dt: float) -> None:
@@ -257,6 +211,26 @@ def checked_values(name: str, given: Any, check: Callable[[str, Any], Any]) -> A
 def schedules(part: Any) -> list[Schedule]:
     """All schedules in a part of a medium."""
     return parts_of(part, lambda x: isinstance(x, Schedule))
+
+
+def held_together(
+    schedules: Sequence[Schedule], begin: float, end: float
+) -> dict[tuple[int, ...], tuple[float, float]]:
+    """Which values of some schedules hold at once from one time to another, h, by their places:
+    with the share of that time, and a time, h, at which they do."""
+    each: dict[tuple[int, ...], tuple[float, float]] = {}
+    if len(schedules) == 1:
+        of = schedules[0]
+        each = {(k,): (share, of.times[k]) for k, share in of.shares(begin, end)}
+    else:
+        times = sorted({begin, end, *(t for x in schedules for t in x.changes(begin, end))})
+        for low, high in pairwise(times):
+            middle = 0.5 * (low + high)
+            places = tuple(x.place(middle) for x in schedules)
+            share, time = each.get(places, (0.0, middle))
+            each[places] = share + (high - low) / (end - begin), time
+    # rounded, so that a period of the schedules has the same shares as the one before
+    return {places: (s, time) for places, (x, time) in each.items() if (s := round(x, 9)) > 0}
 
 
 def at_time(part: Any, time: float) -> Any:

@@ -11,7 +11,8 @@ amount is conserved and no value need become negative. `transport_rates` compute
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -145,6 +146,49 @@ class Operator:
         for part in found[1:]:
             out = out + part
         return out
+
+
+def mean(parts: Sequence[tuple[float, Operator]]) -> Operator:
+    """The operator with the mean of the rates and sources of several, each with its share of a
+    step. They differ in flow, source and what is beyond the faces, and in nothing else."""
+    if len(parts) == 1:
+        return parts[0][1]
+    first = parts[0][1]
+    sources = [share * x.source for share, x in parts if x.source is not None]
+    axes = [_mean_exchange([(share, x.axes[k]) for share, x in parts]) for k in range(3)]
+    inside = [(share, x.interior) for share, x in parts if x.interior is not None]
+    rate = lambda k, way: _sum([share * each[k][way] for share, each in inside])
+    uniform = len(inside) == len(parts)
+    return replace(
+        first,
+        axes=(axes[0], axes[1], axes[2]),
+        source=_sum(sources) if sources else None,
+        interior=tuple((rate(k, 0), rate(k, 1)) for k in range(3)) if uniform else None,
+        symmetric=all(x.symmetric for _, x in parts),
+    )
+
+
+def _mean_exchange(parts: Sequence[tuple[float, Exchange]]) -> Exchange:
+    first = parts[0][1]
+    up = _sum([share * x.up for share, x in parts])
+    down = _sum([share * x.down for share, x in parts])
+    into = [(share * x.up.narrow(x.dim, 0, 1), x.low) for share, x in parts]
+    back = [(share * x.down.narrow(x.dim, x.size, 1), x.high) for share, x in parts]
+    return replace(first, up=up, down=down, low=_mean_beyond(into), high=_mean_beyond(back))
+
+
+def _mean_beyond(parts: Sequence[tuple[Tensor, Tensor | None]]) -> Tensor | None:
+    """The concentration beyond a face with which as much enters as on average, from the rates at
+    which it does, each times its share."""
+    given = [rate * beyond for rate, beyond in parts if beyond is not None]
+    if not given:
+        return None
+    rate = _sum([rate for rate, _ in parts])
+    return _sum(given) / torch.where(rate > 0, rate, 1.0)
+
+
+def _sum(parts: Sequence[Tensor]) -> Tensor:
+    return sum(parts[1:], parts[0])
 
 
 def entering(axis: Exchange) -> Tensor | None:
