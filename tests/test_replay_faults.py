@@ -245,3 +245,19 @@ def test_an_effect_that_changes_growth_and_does_not_say_so_is_found():
     same(replayed_end, full_end)
     with pytest.raises(tf.InputError, match=r"Shrinking\.step changed 'length'.*writes"):
         replayed(untold, 8)
+
+
+@pytest.mark.parametrize("chosen", [None, [1, 0]])
+def test_cells_that_were_removed_between_steps_are_noticed(chosen):
+    """Their colony is named; other colonies of the recording, or fewer, may be followed."""
+    model = lit().bind(2, streams=[0, 1])
+    replay = tf.Replay(model, tf.GrowthRecording(lit(), streams=(0, 1)))
+    state = stepped(replay, replay.start(), 40)
+    state = state if chosen is None else state.select(chosen)
+    replay.step(state)
+    row = int(torch.nonzero(state.colony_id.index_select(0, state.colony) == 1)[0])
+    gone = torch.arange(state.cells) == row
+    cells = int(state.counts[0 if chosen else 1])
+    said = rf"colony 1 has {cells - 1} cells, .* recorded with {cells} after 40 steps.*model\.step"
+    with pytest.raises(tf.InputError, match=said):
+        replay.step(state.remove(gone, "removed"))

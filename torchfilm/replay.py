@@ -27,6 +27,7 @@ from torchfilm.state import CELL, PER_CELL, Births, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import unchanged
 from torchfilm.tools.ragged import expand_ranges, offsets
+from torchfilm.tools.reads import reads_are_free
 from torchfilm.tools.threads import after_fork, one_torch_thread
 from torchfilm.tools.warn_once import once
 from torchfilm.turns import Part
@@ -109,6 +110,7 @@ class GrowthRecording(metaclass=checks.KnownKeywords):
         )
         self.state = self.model.start()
         self.steps: list[list[RecordedChange]] = []
+        self.counts: list[Tensor] = []  # of cells (R,) as each step began
         self.failed: dict[int, tuple[int, str]] = {}
         self._lock = threading.Lock()
 
@@ -134,6 +136,7 @@ class GrowthRecording(metaclass=checks.KnownKeywords):
     def _step(self, state: State) -> State:
         """The state one step later; what each effect changed is kept. The same step may be done
         again, with the same result."""
+        self.counts[state.step :] = [state.counts]
         state = self.model.opened(state, self.dt)
         noted: list[RecordedChange] = []
         failed = {s: (at, why) for s, (at, why) in self.failed.items() if at < state.step}
@@ -286,10 +289,12 @@ class Replay(metaclass=checks.KnownKeywords):
         followed = _Followed(place)
         changes = {change.part: change for change in self.recording.changes(number)}
         if any(a.step == number for a in state.arrived):
-            raise checks.InputError(
-                "cells were added to the state, but growth was recorded without them. Step the"
-                " model itself: replay.model.step(state)."
-            )
+            raise _other_cells("cells were added to the state", "without them")
+        grown = self.recording.counts[number].index_select(0, place)
+        if reads_are_free(state.device) and not torch.equal(state.counts, grown):
+            at = int((state.counts != grown).nonzero()[0])
+            change = f"colony {int(state.colony_id[at])} has {int(state.counts[at])} cells"
+            raise _other_cells(change, f"with {int(grown[at])} after {number} steps")
         state = self.model.opened(state, self.dt)
         if FIRST in changes:
             state = self._apply(state, changes[FIRST], followed)
@@ -380,6 +385,13 @@ class _Followed:
             self._cells = expand_ranges(begin, counts.index_select(0, self.unit))
             self._counts = counts
         return self._cells
+
+
+def _other_cells(change: str, recorded: str) -> checks.InputError:
+    return checks.InputError(
+        f"{change}, but growth was recorded {recorded}. Step the model itself:"
+        " replay.model.step(state)."
+    )
 
 
 def _repeated(place: Tensor) -> tuple[Tensor, int]:
