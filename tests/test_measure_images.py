@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 import torchfilm as tf
+from torchfilm.tools.tangents import forward_mode
 
 WINDOW = ((-8.0, -6.0), (8.0, 6.0))
 PLACES = [[0.0, 0.0], [4.0, 2.0], [-5.0, -3.0]]
@@ -103,6 +105,11 @@ def test_cells_across_the_faces_are_seen_at_both():
     [
         (lambda s: tf.measure.image(s, "yfp", pixel_size=0.1, window=WINDOW), "'yfp'"),
         (lambda s: tf.measure.image(s, [], pixel_size=0.1, window=WINDOW), "one or more"),
+        (
+            lambda s: tf.measure.image(s, np.ones(3), pixel_size=0.1, window=WINDOW),
+            r"image\(names\).*one or more",
+        ),
+        (lambda s: tf.measure.medium(s, "ahl", pixel_size=1.0, window=WINDOW), "scene's Medium"),
         (lambda s: tf.measure.image(s, "gfp", pixel_size=0.0, window=WINDOW), "pixel_size"),
         (lambda s: tf.measure.image(s, "gfp", pixel_size=1e-5, window=WINDOW), "at most"),
         (lambda s: tf.measure.image(s, "gfp", pixel_size=1.0, window=((1, 1), (0, 2))), "window"),
@@ -121,3 +128,69 @@ def test_what_is_refused(make, said):
 def test_sections_need_a_height():
     with pytest.raises(tf.InputError, match="the height of the section"):
         tf.measure.labels(colony(3), pixel_size=1.0, window=WINDOW)
+
+
+@pytest.mark.parametrize("profile", ["thickness", "flat"])
+def test_an_image_has_derivatives_by_what_cells_hold(profile):
+    """Backward and forward, each colony's own; and raises for one by places."""
+    state = colony(2, colonies=2)
+    weights = torch.rand(2, 2, 24, 32, generator=torch.Generator().manual_seed(0)).double()
+
+    def total(gfp, state=state):
+        given = [gfp, gfp**2]
+        made = tf.measure.image(state, given, pixel_size=0.5, window=WINDOW, profile=profile)
+        return (weights * made).sum()
+
+    gfp = state.gfp.double().requires_grad_()
+    with forward_mode():
+        pass  # makes torch ready for it
+    assert torch.autograd.gradcheck(total, gfp, check_forward_ad=True)
+    moving = state.replace(length=state.length.clone().requires_grad_())
+    with pytest.raises(tf.InputError, match=r"by quantities of cells and by nothing else"):
+        total(gfp, moving).backward()
+    with forward_mode(), pytest.raises(tf.InputError, match="by nothing else"):
+        total(gfp, state.replace(length=forward_ad.make_dual(state.length, state.length)))
+    assert torch.equal(total(gfp, moving), total(gfp))
+
+
+def signals(dim, **more):
+    box = ((-8.0, -6.0), (8.0, 6.0)) if dim == 2 else ((-8.0, -6.0, -4.0), (8.0, 6.0, 4.0))
+    plane = lambda at: 1.0 + 0.1 * at[:, 0] + 0.02 * at[:, 1] + 0.05 * at[:, -1] * (dim == 3)
+    medium = tf.Medium(
+        a=tf.Signal(diffusion=1.0, initial=plane), b=tf.Signal(diffusion=1.0), box=box,
+        spacing=2.0, **more,
+    )  # fmt: skip
+    state = tf.Scene(tf.Growth(rate=1.0), medium, dim=dim).bind(2, dtype=torch.float64).start()
+    return state.with_fields(**{"out.b": 1.0 + state.layout.grid.owner.double()})
+
+
+@pytest.mark.parametrize(("dim", "z"), [(2, None), (3, 1.0)])
+def test_images_of_a_medium_are_what_cells_would_find(dim, z):
+    state = signals(dim)
+    inner = ((-6.0, -4.0), (6.0, 4.0))
+    found = tf.measure.medium(state, ["a", "b"], pixel_size=0.5, window=inner, z=z)
+    assert found.shape == (2, 2, 16, 24) and found.dtype == torch.float64
+    y = torch.arange(3.75, -4.0, -0.5, dtype=torch.float64).unsqueeze(1)
+    x = torch.arange(-5.75, 6.0, 0.5, dtype=torch.float64)
+    plane = 1.0 + 0.1 * x + 0.02 * y + (0.05 if dim == 3 else 0.0)
+    torch.testing.assert_close(found[:, 0], plane.expand(2, 16, 24), rtol=1e-12, atol=0)
+    assert found[0, 1].unique().tolist() == [1.0] and found[1, 1].unique().tolist() == [2.0]
+
+
+@pytest.mark.parametrize("outside", ["error", "reservoir"])
+def test_beyond_the_box_there_is_no_medium_or_the_reservoir(outside):
+    state = signals(2, outside=outside)
+    wide = ((-10.0, -6.0), (10.0, 6.0))
+    found = tf.measure.medium(state, "b", pixel_size=1.0, window=wide)[:, 0]
+    beyond = torch.zeros(12, 20, dtype=torch.bool)
+    beyond[:, :2] = beyond[:, -2:] = True
+    if outside == "error":
+        assert torch.equal(found.isnan(), beyond.expand(2, 12, 20))
+    else:
+        assert (found[:, beyond] == 0.0).all() and not found.isnan().any()
+    voxels = state.signals["b"].clone().requires_grad_()
+    seen = tf.measure.medium(state.with_fields(**{"out.b": voxels}), "b", pixel_size=1.0,
+                             window=((-2.0, -2.0), (2.0, 2.0)))  # fmt: skip
+    seen[0].sum().backward()
+    assert float(voxels.grad.sum()) == pytest.approx(16.0)
+    assert not voxels.grad.reshape(2, -1)[1].any()

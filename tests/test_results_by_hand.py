@@ -61,7 +61,7 @@ def test_cells_that_are_removed_by_hand_have_an_end(tmp_path, at):
         tree = results.lineage()
     rows = tree.rows(before.own_colony_id[gone].numpy(), before.uid[gone].numpy())
     assert len(rows) > 3 and set(tree.fate[rows]) == {"removed"}
-    assert np.allclose(tree.ended[rows], before.time + 0.05)
+    assert np.allclose(tree.ended[rows], before.time)
     assert np.allclose(tree.end_length[rows], before.length[gone].numpy())
 
 
@@ -77,7 +77,7 @@ def test_cells_that_are_removed_before_a_run_resumes_have_an_end(tmp_path):
     gone = last.uid % 2 == 1
     rows = tree.rows(last.own_colony_id[gone].numpy(), last.uid[gone].numpy())
     assert len(rows) > 3 and set(tree.fate[rows]) == {"removed"}
-    assert np.allclose(tree.ended[rows], 2.05)
+    assert np.allclose(tree.ended[rows], 2.0)
     assert np.allclose(tree.end_length[rows], last.length[gone].numpy())
 
 
@@ -201,3 +201,26 @@ def test_a_state_without_a_signal_does_not_resume_a_file_that_has_it(tmp_path):
     with pytest.raises(tf.InputError, match="lacks the field 'b'"):
         list(tf.simulate(other, state, until=0.4, record=recorder))
     assert path.read_bytes() == before
+
+
+def test_a_file_that_goes_on_keeps_its_interval(tmp_path):
+    path, scene = tmp_path / "run.h5", scene_of()
+    stored(path, scene, until=0.4, every=4)
+    for until, every in ((1.0, None), (1.2, 2)):
+        with tf.Results(path) as results:
+            last = results.state(scene)
+        more = {} if every is None else {"every": every}
+        stored(path, scene, state=last, until=until, append=True, **more)
+    with tf.Results(path) as results:
+        assert results.steps.tolist() == [0, 4, 8, 12, 16, 20, 22, 24]
+
+
+def test_what_is_no_state_is_not_sent():
+    run = tf.simulate(scene_of(), until=1.0, colonies=1)
+    first = scene_of().bind().start()
+    with pytest.raises(tf.InputError, match="before the first state of the run"):
+        run.send(first)
+    now = next(run)
+    with pytest.raises(tf.InputError, match=r"send\(state\) = .*a tf.State"):
+        run.send((now, 1))
+    assert run.send(now).step == 2

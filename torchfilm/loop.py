@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchfilm.reports import Concern, Report
 from torchfilm.state import State
+from torchfilm.tools import checks
 from torchfilm.tools.checks import SimulationError
 from torchfilm.tools.reads import numbers
 from torchfilm.tools.warn_once import warn
@@ -57,6 +58,13 @@ class States(Generator[State, State | None, None]):
         return self.send(None)
 
     def send(self, value: State | None) -> State:
+        if value is not None and not isinstance(value, State):
+            raise checks.input_error("send(state)", value, "a tf.State")
+        if value is not None and not self._begun:
+            raise checks.InputError(
+                "send(state) before the first state of the run: take that first, by next(run), or"
+                " begin with yours, tf.simulate(scene, state)."
+            )
         self._begun = True
         return self._states.send(value)
 

@@ -34,7 +34,8 @@ class Target(metaclass=checks.KnownKeywords):
     The loss of a colony is a number: 0 is perfect and, for most ready targets, 1 is the worst. A
     colony that failed scores `failed`; so does one whose loss is above that, which counts as a
     failure. The loss depends on the cells of that colony alone, not on its batch. It has gradients
-    with respect to the levels in the cells, but not to places, types and volumes.
+    with respect to the levels in the cells, but not to places, types and volumes; a target of
+    yours that has them says so by `differentiable = True`.
     """
 
     failed: ClassVar[float] = WORST
@@ -46,6 +47,8 @@ class Target(metaclass=checks.KnownKeywords):
     comparable: ClassVar[bool] = False
     # whether the columns that it notes differ in number from step to step
     ragged: ClassVar[bool] = False
+    # whether the loss has exact derivatives by what cells contain, for descents
+    differentiable: ClassVar[bool] = False
     # whether it asks how many cells are lit, and not which
     anywhere: ClassVar[bool] = False
 
@@ -127,7 +130,8 @@ class Target(metaclass=checks.KnownKeywords):
     def why_rough(self, state: tf.State) -> str:
         """Why the loss has no exact derivatives by what cells contain, as a first state shows; ""
         where it has."""
-        return ""
+        own = f"a target of your own may pass no gradient ({type(self).__name__}.differentiable)"
+        return "" if self.differentiable else own
 
     def reduced(self, losses: np.ndarray) -> np.ndarray | None:
         """One loss for each design, (n,), from those of its replicates (n, R); None: as the task

@@ -6,7 +6,10 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 import torchfilm as tf
@@ -19,6 +22,8 @@ if TYPE_CHECKING:
 Centre = Literal["colony"] | tuple[float, float]
 ALONG = ("x", "y", "z", "radius", "edge", "top")
 COLOURS = ("#c2185b", "#1976d2", "#388e3c", "#f57c00", "#7b1fa2", "#5d4037")  # of the species
+
+PIXEL, MOST_PIXELS = 0.25, 500  # of an outline: a side, µm, at least; and how many
 
 
 def check_profile(kind: str, floor: object, edge_width: object = 1.0) -> None:
@@ -176,4 +181,28 @@ def draw_below_top(
     for depth in (d for d in depths if math.isfinite(d)):
         line = x[order].cpu().numpy(), (top - depth)[order].cpu().numpy()
         ax.plot(*line, color=colour, linestyle=style, linewidth=1.0, zorder=3)
+    ax.set(xlim=window[0], ylim=window[1])
+
+
+def draw_region(ax: Axes, state: tf.State, place: int, level: Tensor, colour: str) -> None:
+    """Draw the outline of where the cells of the colony at `place` of the batch should be lit, by
+    their level (N,) from 0 to 1, and keep the limits of the axes."""
+    mine = state.colony == place
+    if not bool(mine.any()):
+        return
+    window = ax.get_xlim(), ax.get_ylim()
+    # each voxel is of the cell whose centreline is nearest, if that is near
+    along = torch.linspace(-0.5, 0.5, 5, dtype=state.dtype, device=state.device).reshape(-1, 1, 1)
+    middle, axis = state.position[mine, :2].to(state.dtype), state.axis[mine, :2]
+    points = (middle + along * state.length[mine].unsqueeze(1) * axis).reshape(-1, 2).cpu().numpy()
+    levels = level[mine].detach().repeat(len(along)).cpu().numpy()
+    step = max(PIXEL, *(abs(high - low) / MOST_PIXELS for low, high in window))
+    x, y = (np.arange(min(ends), max(ends) + step, step) for ends in window)
+    grid = np.stack(np.meshgrid(x, y), -1)
+    apart, nearest = cKDTree(points).query(grid.reshape(-1, 2))
+    reach = 2.0 * float(state.radius[mine].max()) + step
+    lit = np.where(apart < reach, levels[nearest], 0.0).reshape(grid.shape[:2])
+    lit = gaussian_filter(lit, 0.5 * reach / step)  # the ends of single cells are of no interest
+    if lit.min() < 0.5 < lit.max():
+        ax.contour(x, y, lit, levels=[0.5], colors=colour, linewidths=0.8)
     ax.set(xlim=window[0], ylim=window[1])

@@ -37,6 +37,7 @@ class Burden(Target):
     species: by default all species of all circuits.
     """
 
+    differentiable = True
     species: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -74,6 +75,8 @@ class Burden(Target):
 @dataclass(frozen=True)
 class Duration(Target):
     """The hours that a colony takes to its end: for scenes in which the design sets the pace."""
+
+    differentiable = True
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         hours = float(state.time)

@@ -62,6 +62,7 @@ class Observed(Target):
     two colonies the loss of a right model is up to 5.
     """
 
+    differentiable = True
     pattern = False
     comparable = True
     values: tuple[float, ...]

@@ -53,6 +53,7 @@ class Oscillation(Target):
     a population whose phases have spread is small.
     """
 
+    differentiable = True
     failed = FAILED
     species: str
     period: float

@@ -52,6 +52,7 @@ class DomainSize(Target):
     whose states are random.
     """
 
+    differentiable = True
     failed = FAILED
     species: tuple[str, str]
     size: float
@@ -158,6 +159,7 @@ class OnFraction(Target):
     on or off.
     """
 
+    differentiable = True
     failed = FAILED
     anywhere = True
     species: str

@@ -81,6 +81,7 @@ class ProfileTarget(Target):
     the colony is seen from above.
     """
 
+    differentiable = True
     floor: float
     failed = FAILED
     fewest = 10

@@ -18,6 +18,7 @@ from design.targets.geometry import (
     COLOURS,
     between,
     check_profile,
+    draw_region,
     half,
     lines,
     offset,
@@ -215,7 +216,7 @@ class Stripe(ProfileTarget):
     @property
     def mark(self) -> str:
         if self.winds:
-            return "red dots: cells that should be lit"
+            return "red outline: cells that should be lit"
         return "red lines" + (", dotted: the border" if self.at == "border" else "")
 
     def why_undefined(self, measure: str) -> str:
@@ -229,18 +230,11 @@ class Stripe(ProfileTarget):
         return ""
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        """Draw the edges of the stripe and the border as lines or, where it winds, a dot on each
-        cell that should be lit."""
+        """Draw the edges of the stripe and the border as lines or, where it winds, an outline of
+        the cells that should be lit."""
         if self.winds:
-            mine = (
-                (state.colony == place)
-                & self.counted(state)
-                & (self.target_profile(state)[:, 0] > 0.5)
-            )
-            x, y = state.position[mine, :2].cpu().numpy().T
-            # small enough to leave the colour of a cell to be seen
-            size = 3.0 * min(1.0, max(0.5, (100 / max(1, int(state.counts[place]))) ** 0.5))
-            ax.plot(x, y, ".", color=COLOURS[0], ms=size, mew=0)
+            level = torch.where(self.counted(state), self.target_profile(state)[:, 0], 0.0)
+            draw_region(ax, state, place, level, COLOURS[0])
             return
         at, middle = (float(v[place]) for v in self.reference(state)[:2])
         lines(

@@ -147,3 +147,22 @@ def test_a_users_own_target_needs_a_loss_only(ax):
     )
     with pytest.raises(NotImplementedError, match=r"Target\.loss"):
         Target().loss(state())
+
+
+def test_a_stripe_that_winds_is_outlined(ax):
+    """Around the cells that should be lit, and no others."""
+    x, y = np.meshgrid(np.arange(-9.0, 10.0), np.arange(-7.0, 8.0))
+    kind = (x > 2 * np.sin(y)).astype(int).ravel()
+    turned = np.stack([x, y], -1).reshape(-1, 2)
+    field = placed(turned, cell_type=kind, yfp=np.zeros(len(kind)))
+    target = Stripe("yfp", at="border", width=4.0, cell_type=1, straight=False)
+    wide = (-14.0, 14.0), (-12.0, 12.0)
+    ax.set(xlim=wide[0], ylim=wide[1])
+    target.draw(ax, field, 0)
+    (outline,) = ax.collections
+    paths = [p for p in outline.get_paths() if len(p.vertices)]
+    inside = np.any([p.contains_points(turned) for p in paths], axis=0)
+    lit = (target.target_profile(field)[:, 0] > 0.5).numpy() & (kind == 1)
+    assert 0 < lit.sum() < kind.sum()
+    assert (inside == lit).mean() > 0.97
+    assert (ax.get_xlim(), ax.get_ylim()) == wide

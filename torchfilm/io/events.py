@@ -62,7 +62,7 @@ def arrived_since(before: State, state: State) -> list[Arrived]:
 
 
 def ends_of(state: State, ended: Iterable[Ended]) -> list[Rows]:
-    """Ends, which came in the step to a state."""
+    """Ends, which came in the step to a state; or after it, before the next, by hand."""
     found = []
     for e in ended:
         steps, fates, times = (

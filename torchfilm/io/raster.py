@@ -101,13 +101,21 @@ def thickness_image(rods: Rods, weights: np.ndarray, raster: Raster, flat: bool)
     """Σ over cells of weights (M, N) times how long the vertical line through the centre of each
     pixel runs inside the cell, µm: (M, rows, columns). flat: 1 instead of that length."""
     out = np.zeros((len(weights), raster.shape[0] * raster.shape[1]))
-    for cell, at, x, y in _pixels(rods, raster):
-        chord = _chord(rods, cell, x, y)
-        if flat:
-            chord = (chord > 0).astype(float)
+    for cell, at, chord in thickness_at_pixels(rods, raster, flat):
         for image, weight in zip(out, weights, strict=True):
             np.add.at(image, at, chord * weight[cell])
     return out.reshape(len(weights), *raster.shape)
+
+
+def thickness_at_pixels(
+    rods: Rods, raster: Raster, flat: bool
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """The terms of a `thickness_image` of ones, some cells at a time: the cell, the place of the
+    pixel in the flat image, and the length, µm, (K,) each."""
+    for cell, at, x, y in _pixels(rods, raster):
+        chord = _chord(rods, cell, x, y)
+        (seen,) = np.nonzero(chord > 0)
+        yield cell[seen], at[seen], np.ones(len(seen)) if flat else chord[seen]
 
 
 def _pixels(

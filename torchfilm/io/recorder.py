@@ -40,19 +40,19 @@ from torchfilm.io.room import SPARE_BYTES, check_room, free_bytes
 from torchfilm.model import Model
 from torchfilm.scene import Scene
 from torchfilm.state import State
-from torchfilm.state_colonies import Ended
 from torchfilm.tools import checks
 from torchfilm.tools.checks import SimulationError
 from torchfilm.tools.whole_files import why_not_written
 from torchfilm.version import __version__
 
+EVERY = 10  # steps from one frame to the next
 # Suffixes of formats that a run might be thought to write: such a name would mislead.
 OF_OTHERS = (".csv", ".tsv", ".json", ".txt", ".xml")
 
 
 class Recorder(metaclass=checks.KnownKeywords):
     """An observer that writes every `every`-th step of a run to an HDF5 file, and on `close` the
-    last one.
+    last one. every: by default 10; with `append` as the file has it.
 
     path: a new file. With `overwrite` it may exist: the new file is written beside it, as
     `path.new`, and replaces it when its first frame is on the disk. A run that fails earlier leaves
@@ -66,13 +66,14 @@ class Recorder(metaclass=checks.KnownKeywords):
         path: str | Path,
         scene: Scene,
         *,
-        every: int = 10,
+        every: int | None = None,
         overwrite: bool = False,
         append: bool = False,
         changed: bool = False,
     ):
         self.path, self.scene = checks.file_path("record", path), scene
-        self.every = checks.integer("every", every, least=1)
+        self.every = EVERY if every is None else checks.integer("every", every, least=1)
+        self._as_before = every is None
         self.overwrite, self.append, self.changed = overwrite, append, changed
         self._check_path()
         # where a link leads; the path itself may be relative to a folder that the process leaves
@@ -86,9 +87,6 @@ class Recorder(metaclass=checks.KnownKeywords):
         # events since the last frame that is written
         self.births: list[events.Rows] = []
         self.ends: list[events.Rows] = []
-        self.absent: list[
-            Ended
-        ] = []  # of the last frame, where the state that resumes it lacks them
         self.last: State | None = None
         self.written = -1
 
@@ -142,11 +140,11 @@ class Recorder(metaclass=checks.KnownKeywords):
         if self.file is None:
             self._open(state)  # earlier events belong to no frame of this run
             return
-        by_hand = [] if before is None else events.removed_before(state, before)
-        come = [] if before is None else events.arrived_since(before, state)
-        self.births += events.arrivals_of(come, state) + events.births_of(state)
-        self.ends += events.ends_of(state, [*self.absent, *by_hand, *state.ended])
-        self.absent = []
+        if before is not None:
+            self.births += events.arrivals_of(events.arrived_since(before, state), state)
+            self.ends += events.ends_of(before, events.removed_before(state, before))
+        self.births += events.births_of(state)
+        self.ends += events.ends_of(state, state.ended)
         if (state.step - self.first_step) % self.every == 0:
             self._write(state)
 
@@ -170,7 +168,7 @@ class Recorder(metaclass=checks.KnownKeywords):
     def _open(self, state: State) -> None:
         """Make the new file, complete with a frame, under another name; then put it in place."""
         self._check_still_free()
-        self.births, self.ends, self.absent = [], [], []
+        self.births, self.ends = [], []
         try:
             with ExitStack() as hold:
                 if self.append:
@@ -241,10 +239,12 @@ class Recorder(metaclass=checks.KnownKeywords):
         """A copy of the file, which ends with this state."""
         with Results(self.path) as kept:
             self._check_resumed(kept, state)
-            self.absent = events.absent_from(state, kept.frame(), kept.colony_id)
+            absent = events.absent_from(state, kept.frame(), kept.colony_id)
+            self.ends += events.ends_of(state, absent)
             come = events.just_arrived(state, kept.next_uid())
             self.births += events.arrivals_of(come, state.replace(ended=()))
             self.written, self.first_step = int(kept.steps[-1]), int(kept.steps[0])
+            self.every = int(kept.attributes["every"]) if self._as_before else self.every
         check_room(
             self.target, self.target.stat().st_size, f"to resume {self.path}, by a copy of it",
             "The file is whole. Free some space and resume.",

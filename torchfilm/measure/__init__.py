@@ -5,7 +5,7 @@ from torchfilm.film_shape import Film
 from torchfilm.measure.change import displacement, growth_rates
 from torchfilm.measure.forces import Overlap, WallForces, overlaps, pressure, wall_forces
 from torchfilm.measure.hull import Hull, hull
-from torchfilm.measure.images import image, labels
+from torchfilm.measure.images import image, labels, medium
 from torchfilm.measure.mixing import alike_neighbours, clusters, heterozygosity, strains
 from torchfilm.measure.shape import (
     aspect_ratio,
@@ -39,6 +39,7 @@ __all__ = [
     "hull",
     "image",
     "labels",
+    "medium",
     "moran",
     "neighbours",
     "nematic_order",
