@@ -251,6 +251,7 @@ def without_gradient(name: str, given: Any) -> Any:
     if given.requires_grad:
         warn(
             f"{name} requires a gradient, which founders do not keep. Put it into the first state:"
-            " state.replace(position=…) or state.with_fields(…), before the first step."
+            " state.replace(position=…) or state.with_fields(…), before the first step; or into the"
+            " state that model.add returns."
         )
     return given.detach().cpu()
