@@ -64,6 +64,23 @@ def test_a_voxel_that_loses_a_million_times_as_much_is_solved_for_by_its_weight(
     assert float((coarse - expected).abs().max()) > 1e-4  # without it others are left unsolved
 
 
+def test_each_colony_is_solved_for_by_its_own_weights():
+    """Another voxel of each loses a million times as much."""
+    loss, b = torch.full((3, *SHAPE), 0.1, dtype=F64), drawn(3, *SHAPE)
+    for k in range(3):
+        loss[k, k, 2, 1], b[k, k, 2, 1] = 1e9, 1e11
+    made = lambda of, count: build_operator(
+        SHAPE, (1.0, 1.0, 1.0), diffusion=1.0, decay=of, colonies=count, dtype=F64
+    )
+    op = made(loss, 3)
+    weight = 1 / (1 + 50.0 * op.loss)
+    found, good = Systems.of(op, 50.0, False).solved(b, torch.zeros_like(b), weight, LIMITS)
+    for k in range(3):
+        matrix = matrix_of(made(loss[k], 1), 50.0)
+        expected = torch.linalg.solve(matrix, b[k].flatten()).view(SHAPE)
+        assert bool(good[k]) and torch.allclose(found[k], expected, rtol=1e-7, atol=1e-12)
+
+
 def test_a_colony_has_the_same_bits_in_any_company():
     diffusion = torch.tensor([0.4, 30.0, 3.0], dtype=F64)
     made = lambda d: build_operator(
