@@ -200,7 +200,7 @@ def draw_region(ax: Axes, state: tf.State, place: int, level: Tensor, colour: st
     x, y = (np.arange(min(ends), max(ends) + step, step) for ends in window)
     grid = np.stack(np.meshgrid(x, y), -1)
     apart, nearest = cKDTree(points).query(grid.reshape(-1, 2))
-    reach = 2.0 * float(state.radius[mine].max()) + step
+    reach = 1.5 * float(state.radius[mine].max()) + step
     lit = np.where(apart < reach, levels[nearest], 0.0).reshape(grid.shape[:2])
     lit = gaussian_filter(lit, 0.5 * reach / step)  # the ends of single cells are of no interest
     if lit.min() < 0.5 < lit.max():
