@@ -32,8 +32,9 @@ class Show:
     fps: float = 10.0
     """Frames per second of a film."""
     colour: str | None = None
-    """The quantity that colours the cells: angle (the default), growth_rate, cell_type, length,
-    yfp, or any other quantity per cell; founder is a colour for each line of descent."""
+    """The quantity that colours the cells: angle, growth_rate, cell_type, length, yfp, or any other
+    quantity per cell; founder is a colour for each line of descent. By default the cell type where
+    there are several, else the first species, else angle."""
     channels: list[str] = field(default_factory=list)
     """Instead of --colour: several quantities, each with the colour of its light, as NAME=COLOUR,
     such as --channels cfp=cyan yfp=yellow."""

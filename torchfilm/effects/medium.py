@@ -72,7 +72,7 @@ class Medium(Effect):
     these signals are one equation over the step, of second order, whatever crosses a membrane or a
     voxel in seconds. "turns": circuits with a pool for each cell, then transport; of first order,
     and two to three times as fast. Default: together, but in turns where circuits count molecules,
-    a nutrient is exchanged as well, or a `method` or `splitting` is given.
+    a nutrient is exchanged as well, or a `method` or `splitting="lie"` is given.
     steps: into which exchange and transport divide a step of the scene; growth and contacts do not.
 
     method: of transport in turns, and of signals that no cell exchanges: "exponential" (exact if
@@ -82,7 +82,7 @@ class Medium(Effect):
     "lie", cells and then transport. Strang makes the error of the signal many times smaller, for
     one more transport per step.
     backend: "compiled" kernels, on the CPU, or "torch" for transport. Default: compiled where Numba
-    is there; gradients always by torch.
+    is there; gradients by a signal's own numbers by torch where transport is exponential.
     """
 
     signals: Mapping[str, Signal]

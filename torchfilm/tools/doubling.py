@@ -19,7 +19,7 @@ LONG = 0.2
 
 def check_doubling(name: str, rate: Tensor, dt: float) -> None:
     """Raise InputError for growth rates, one or (B,) by colony id, 1/h, by which a cell more than
-    doubles in dt hours; warn of those by which it grows by more than a fifth."""
+    doubles in dt hours; warn of those above a fifth per step."""
     fast = torch.nonzero(rate.reshape(-1) * dt > math.log(2.0)).squeeze(1)
     fastest = float(rate.max())
     if not fast.numel():
