@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import torchfilm as tf
+from torchfilm.effects import medium_transport
 from torchfilm.signals.schedule import held_together
 
 F64 = {"dtype": torch.float64}
@@ -174,3 +175,40 @@ def test_a_periodic_schedule_prepares_the_steps_of_one_period():
     (transport,) = {e.transport for e in model.effects if hasattr(e, "transport")}
     (known,) = transport.carriers.values()
     assert len(known) == 3  # 1, a mean, and 0
+
+
+def test_a_wash_with_a_drug_brings_its_dose():
+    """A flow that comes together with what it brings: the mean of the product."""
+    box = {"box": ((-12, -12), (12, 12)), "spacing": 4.0, "depth": 1.0}
+
+    def amount(dt):
+        faces = tf.BoundaryConditions(
+            x=(tf.Open(tf.Schedule({0: 0.0, 0.12: 1.0, 0.14: 0.0})), tf.NoFlux()), y=tf.NoFlux()
+        )
+        flow = tf.Schedule({0: (0.0, 0.0), 0.12: (40.0, 0.0), 0.14: (0.0, 0.0)})
+        drug = tf.Signal(diffusion=50.0)
+        return float(_food_of(tf.Medium(food=drug, flow=flow, boundary=faces, **box), dt).mean())
+
+    with pytest.warns(UserWarning, match=r"of 0\.12 h for 0\.02 h"):
+        found = amount(0.05)
+    assert found == pytest.approx(40.0 * 0.02 / 24, rel=1e-6) == amount(0.02)
+
+
+def _food_of(medium, dt):
+    return _food(tf.Scene(medium, dim=2), dt, 0.2)
+
+
+def test_a_fine_ramp_makes_one_operator_a_step(monkeypatch):
+    """And gives what its mean over each step gives."""
+    made, usual = [], medium_transport.build_operator
+    counted = lambda *args, **given: made.append(1) or usual(*args, **given)
+    monkeypatch.setattr(medium_transport, "build_operator", counted)
+    ramp = tf.Schedule({k / 3600: k / 3600 for k in range(720)})
+    box = {"box": ((-12, -12), (12, 12)), "spacing": 4.0, "depth": 1.0}
+    scene = tf.Scene(tf.Medium(food=tf.Signal(diffusion=50.0, source=ramp), **box), dim=2)
+    model = scene.bind(**F64)
+    state, before = model.start(), len(made)
+    for _ in range(4):
+        state = model.step(state, 0.05)
+    assert len(made) - before == 4
+    assert float(state.signals["food"][0]) == pytest.approx(0.02 - 0.1 / 3600, rel=1e-6)

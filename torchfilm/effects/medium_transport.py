@@ -20,7 +20,14 @@ from torchfilm.resolver import snapshot
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.grid import Grid, GridBatch
 from torchfilm.signals.layout import Layout
-from torchfilm.signals.schedule import Schedule, at_time, each_value, held_together, schedules
+from torchfilm.signals.schedule import (
+    Schedule,
+    at_time,
+    each_value,
+    held_together,
+    mean_of,
+    schedules,
+)
 from torchfilm.signals.transport import Carrier, carry, check_method, choose, prepare
 from torchfilm.signals.transport_operator import Operator, mean
 from torchfilm.signals.transport_rates import build_operator
@@ -137,7 +144,8 @@ class Transport:
         key = _key(held)
         if key not in self._spaces:
             signals, medium = self._given[0], self.medium
-            beyond = {name: self._reservoir(name, held) for name in signals}
+            given = {name: x.reservoir for name, x in signals.items()}
+            beyond = mean_of(given, list(held.values()))
             made = {
                 "periodic": self._given[2][next(iter(signals))].periodic,
                 "height": medium.height,
@@ -146,13 +154,6 @@ class Transport:
             }
             _keep(self._spaces, key, made)
         return self._spaces[key]
-
-    def _reservoir(self, name: str, held: Held) -> Any:
-        """The concentration beyond the box; over a step in which it changes, its mean."""
-        each: list[tuple[float, Any]] = [
-            (share, self.at(time).signals[name].reservoir) for share, time in held.values()
-        ]
-        return each[0][1] if len(each) == 1 else sum(share * x for share, x in each)
 
     def opened(self, state: State) -> State:
         """The state in the space of this medium, also where another model laid its grid."""
@@ -346,8 +347,20 @@ class Transport:
 
     def _operator(self, name: str, state: State, batch: GridBatch) -> Operator:
         """The operator of a signal; in a step in which schedules change, the mean one."""
-        held = self._held(name, state).values()
-        return mean([(x, self._operator_at(self.at(t), name, state, batch)) for x, t in held])
+        apart: dict[tuple[int, ...], list[tuple[float, float]]] = {}
+        for places, piece in self._held(name, state).items():
+            key = tuple(k for k, x in zip(places, self._moving[name], strict=True) if not x.linear)
+            apart.setdefault(key, []).append(piece)
+        given = [{name: x[name]} for x in self._given]
+        return mean(
+            [
+                (
+                    sum(share for share, _ in held),
+                    self._operator_at(Constants(*mean_of(given, held)), name, state, batch),
+                )
+                for held in apart.values()
+            ]
+        )
 
     def _operator_at(self, now: Constants, name: str, state: State, batch: GridBatch) -> Operator:
         signal, layout = now.signals[name], state.layout

@@ -69,6 +69,12 @@ class Schedule(metaclass=checks.KnownKeywords):
         """When each value begins, h, ascending from 0."""
         return tuple(self.values)
 
+    @cached_property
+    def linear(self) -> bool:
+        """Whether its values are numbers, so that what they give has the mean of theirs. That of
+        flows, which carry what comes through a face, and of functions is taken piece by piece."""
+        return all(isinstance(x, Real | Tensor) for x in self.values.values())
+
     def place(self, time: float) -> int:
         """Which of the values holds at a time, h."""
         after = time + ROUNDING * max(1.0, abs(time)) if math.isfinite(time) else time
@@ -236,3 +242,18 @@ def held_together(
 def at_time(part: Any, time: float) -> Any:
     """A part of a medium with the values of its schedules at a time, h."""
     return mapped(part, lambda path, x: x.at(time) if isinstance(x, Schedule) else x)
+
+
+def mean_of(part: Any, held: Sequence[tuple[float, float]]) -> Any:
+    """A part of a medium with the means of its schedules, whose values are numbers or stay as they
+    are, over some times, h, each with its share."""
+    whole = sum(share for share, _ in held)
+
+    def averaged(path: str, x: Any) -> Any:
+        if not isinstance(x, Schedule):
+            return x
+        each = [(share / whole, x.at(time)) for share, time in held]
+        first = each[0][1]
+        return first if all(v is first for _, v in each) else sum(share * v for share, v in each)
+
+    return mapped(part, averaged)
