@@ -148,6 +148,9 @@ def test_an_image_has_derivatives_by_what_cells_hold(profile):
     moving = state.replace(length=state.length.clone().requires_grad_())
     with pytest.raises(tf.InputError, match=r"by quantities of cells and by nothing else"):
         total(gfp, moving).backward()
+    (own,) = torch.autograd.grad(total(gfp, moving), gfp)  # passes no place
+    (same,) = torch.autograd.grad(total(gfp), gfp)
+    assert torch.equal(own, same) and bool(own.any())
     with forward_mode(), pytest.raises(tf.InputError, match="by nothing else"):
         total(gfp, state.replace(length=forward_ad.make_dual(state.length, state.length)))
     assert torch.equal(total(gfp, moving), total(gfp))

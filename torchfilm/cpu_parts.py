@@ -25,9 +25,9 @@ from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.lysis import Lysis
 from torchfilm.effects.medium import Medium
 from torchfilm.effects.medium_reactions import MediumReactions
-from torchfilm.effects.medium_transport import held_tensors
 from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.rules import Rules
+from torchfilm.effects.scaled import held_tensors
 from torchfilm.founders import FirstCells
 from torchfilm.joined_step import JoinedStep, joined
 from torchfilm.parameters import parameters

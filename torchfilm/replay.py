@@ -123,7 +123,7 @@ class GrowthRecording(metaclass=checks.KnownKeywords):
             for c in step
             for x in (c.counts, c.source, *(c.births or ()), *c.values.values())
         )
-        return sum(x.nbytes for x in parts if x is not None)
+        return sum(x.nbytes for x in (*parts, *self.counts) if x is not None)
 
     @torch.no_grad()
     def changes(self, step: int) -> list[RecordedChange]:
@@ -239,7 +239,9 @@ class Replay(metaclass=checks.KnownKeywords):
     """A model of designs on recorded growth: `step` as the model's, with the same result, without
     growth and mechanics.
 
-    model: its streams are among the recording's. `state.ended` is not populated.
+    model: its streams are among the recording's. `state.ended` is not populated. `step` raises
+    InputError for a state to which cells were added or from which cells were removed (of these, on
+    a GPU, it does not know).
     """
 
     def __init__(self, model: Model, recording: GrowthRecording):

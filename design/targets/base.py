@@ -35,7 +35,8 @@ class Target(metaclass=checks.KnownKeywords):
     colony that failed scores `failed`; so does one whose loss is above that, which counts as a
     failure. The loss depends on the cells of that colony alone, not on its batch. It has gradients
     with respect to the levels in the cells, but not to places, types and volumes; a target of
-    yours that has them says so by `differentiable = True`.
+    yours that has them says so by `differentiable = True` (a subclass of a ready one has that
+    already: say False where your loss passes none).
     """
 
     failed: ClassVar[float] = WORST

@@ -186,21 +186,29 @@ def draw_below_top(
 
 def draw_region(ax: Axes, state: tf.State, place: int, level: Tensor, colour: str) -> None:
     """Draw the outline of where the cells of the colony at `place` of the batch should be lit, by
-    their level (N,) from 0 to 1, and keep the limits of the axes."""
+    their level (N,) from 0 to 1, and keep the limits of the axes. In space, of the cells as they
+    are seen from above, where layers mix."""
     mine = state.colony == place
     if not bool(mine.any()):
         return
     window = ax.get_xlim(), ax.get_ylim()
-    # each voxel is of the cell whose centreline is nearest, if that is near
-    along = torch.linspace(-0.5, 0.5, 5, dtype=state.dtype, device=state.device).reshape(-1, 1, 1)
+    # each pixel is of the cell whose centreline is nearest, if that is near
+    radius, length = state.radius[mine].max(), state.length[mine]
+    many = max(2, 1 + math.ceil(float(length.max() / radius)))  # points on a centreline
+    along = torch.linspace(-0.5, 0.5, many, dtype=state.dtype, device=state.device)
     middle, axis = state.position[mine, :2].to(state.dtype), state.axis[mine, :2]
-    points = (middle + along * state.length[mine].unsqueeze(1) * axis).reshape(-1, 2).cpu().numpy()
-    levels = level[mine].detach().repeat(len(along)).cpu().numpy()
+    lines = (middle + along.reshape(-1, 1, 1) * length.unsqueeze(1) * axis).reshape(-1, 2)
+    points, levels = lines.cpu().numpy(), level[mine].detach().repeat(many).cpu().numpy()
+    for name, (low, high) in ({} if state.space is None else state.space.faces).items():
+        if name in "xy":  # with the images beyond both faces
+            period = (high - low) * np.eye(2)["xy".index(name)]
+            points = np.concatenate([points, points - period, points + period])
+            levels = np.tile(levels, 3)
     step = max(PIXEL, *(abs(high - low) / MOST_PIXELS for low, high in window))
     x, y = (np.arange(min(ends), max(ends) + step, step) for ends in window)
     grid = np.stack(np.meshgrid(x, y), -1)
     apart, nearest = cKDTree(points).query(grid.reshape(-1, 2))
-    reach = 1.5 * float(state.radius[mine].max()) + step
+    reach = 1.5 * float(radius) + step
     lit = np.where(apart < reach, levels[nearest], 0.0).reshape(grid.shape[:2])
     lit = gaussian_filter(lit, 0.5 * reach / step)  # the ends of single cells are of no interest
     if lit.min() < 0.5 < lit.max():

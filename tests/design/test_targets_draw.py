@@ -10,6 +10,7 @@ import pytest
 import torch
 from patterned import placed
 
+import torchfilm as tf
 from design.targets import (
     Bands,
     DomainSize,
@@ -21,6 +22,7 @@ from design.targets import (
     Stripe,
     Target,
 )
+from design.targets.geometry import draw_region
 
 WINDOW = (-10.0, 10.0), (-8.0, 8.0)
 
@@ -166,3 +168,21 @@ def test_a_stripe_that_winds_is_outlined(ax):
     assert 0 < lit.sum() < kind.sum()
     assert (inside == lit).mean() > 0.97
     assert (ax.get_xlim(), ax.get_ylim()) == wide
+
+
+def test_an_outline_goes_around_long_cells_and_across_faces(ax):
+    """As wide all along a cell, and on both sides of a periodic space."""
+    long = placed([(0.0, 0.0)], length=14.0, yfp=[1.0])
+    draw_region(ax, long, 0, torch.ones(1), "red")
+    (path,) = [p for c in ax.collections for p in c.get_paths()]
+    along = np.stack([np.linspace(-7.0, 7.0, 29), np.full(29, 0.6)], 1)
+    assert path.contains_points(along).all() and not path.contains_points(along * [1, 2.5]).any()
+    for c in list(ax.collections):
+        c.remove()
+    cells = tf.Cells([[9.8, 0.0]], [[0.0, 1.0]], 2.0, 0.5)
+    scene = tf.Scene(
+        tf.Growth(), tf.Mechanics(dim=2, periodic={"x": (-10.0, 10.0)}), founders=cells
+    )
+    draw_region(ax, scene.bind().start(), 0, torch.ones(1), "red")
+    x = np.concatenate([p.vertices[:, 0] for c in ax.collections for p in c.get_paths()])
+    assert (x < -9.0).any() and (x > 9.0).any() and not (abs(x) < 8.0).any()

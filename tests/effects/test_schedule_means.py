@@ -212,3 +212,82 @@ def test_a_fine_ramp_makes_one_operator_a_step(monkeypatch):
         state = model.step(state, 0.05)
     assert len(made) - before == 4
     assert float(state.signals["food"][0]) == pytest.approx(0.02 - 0.1 / 3600, rel=1e-6)
+
+
+def test_gradients_reach_a_reservoir_in_each_run_of_a_bound_model():
+    """Also after a run without them, and with a backward pass for each run."""
+    value = torch.tensor(2.0, requires_grad=True, **F64)
+    model = _beyond(tf.Schedule({0: 0.0, 0.12: value, 0.34: 0.0})).bind(**F64)
+
+    def found():
+        state = model.start()
+        for _ in range(5):
+            state = model.step(state, 0.1)
+        return state.found.sum()
+
+    with torch.no_grad():
+        assert float(found()) == pytest.approx(0.44)
+    for _ in range(2):
+        value.grad = None
+        found().backward()
+        assert float(value.grad) == pytest.approx(0.22)
+
+
+def _beyond(reservoir):
+    """A cell far beyond the box, which adds up what it finds."""
+
+    def find(cells):
+        cells.found = cells.found + cells.signals["food"] * cells.dt / cells.p.one
+
+    food = tf.Signal(diffusion=1.0, reservoir=reservoir)
+    one = tf.Signal(diffusion=1.0, reservoir=tf.Schedule({0: 1.0, 0.3: 1.0}))
+    return tf.Scene(
+        tf.Rules(find, variables={"found": 0.0}, parameters={"one": 1.0}),
+        tf.Medium(
+            food=food, one=one, box=((-9, -9), (9, 9)), spacing=3.0, outside="reservoir"
+        ),
+        founders=tf.Cells([[50.0, 0.0]], [[1.0, 0.0]]), dim=2,
+    )  # fmt: skip
+
+
+def test_rules_that_are_tried_find_what_reservoirs_hold():
+    """Of two schedules, in a step of no time as binding takes it."""
+    least = []
+
+    def find(cells):
+        least.append(float(cells.signals["food"].min()))
+
+    medium = tf.Medium(
+        food=tf.Signal(diffusion=1.0, reservoir=tf.Schedule({0: 4.0, 1: 2.0}), initial=4.0),
+        b=tf.Signal(diffusion=1.0, reservoir=tf.Schedule({0: 3.0, 1: 2.0})),
+        box=((-9, -9), (9, 9)), spacing=3.0, outside="reservoir",
+    )  # fmt: skip
+    founders = tf.Cells([[50.0, 0.0]], [[1.0, 0.0]])
+    scene = tf.Scene(tf.Rules(find), medium, founders=founders, dim=2)
+    *_, state = tf.simulate(scene, until=0.1)
+    *_, state = tf.simulate(scene, state, until=0.2)
+    assert min(least) == 4.0
+    assert held_together([tf.Schedule({0: 1.0, 1: 2.0})] * 2, 1.0, 1.0) == {(1, 1): (1.0, 1.0)}
+
+
+@pytest.mark.parametrize("late", [0.01, 0.06])
+@pytest.mark.parametrize("splitting", ["strang", "lie"])
+def test_voxels_of_a_growing_box_have_the_dose_of_the_others(late, splitting):
+    """In the step in which they come, whichever part of it has the pulse."""
+
+    def states(source):
+        scene = tf.Scene(
+            tf.Motility(speed=1.4), tf.Mechanics(dim=2),
+            tf.Medium(
+                m=tf.Signal(diffusion=10.0, source=source), box=((-4, -4), (4, 4)), spacing=1.0,
+                outside="grow", margin=2.0, splitting=splitting,
+            ),
+            founders=tf.Cells([[1.8, 0.0]], [[1.0, 0.0]]),
+        )  # fmt: skip
+        return [*tf.simulate(scene, scene.bind(**F64).start(), until=0.4, dt=0.1)]
+
+    nodes = [s.layout.grid.nodes for s in states(1.0)]
+    at = 0.1 * next(k for k in range(1, 4) if nodes[k] > nodes[k - 1]) + late
+    with pytest.warns(UserWarning, match="less than a step"):
+        last = states(tf.Schedule({0: 0.0, at: 1.0, at + 0.03: 0.0}))[-1]
+    assert last.signals["m"].numpy() == pytest.approx(0.03, rel=1e-9)

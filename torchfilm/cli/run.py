@@ -209,7 +209,7 @@ class Resume:
                 )
             scene = Settings.named(results.accuracy, str(self.file)).apply(scene)
             state = results.state(scene, device=self.device, changed=self.changed)
-            dt, every = float(results.attributes["dt"]), int(results.attributes["every"])
+            dt = float(results.attributes["dt"])
         if self.picture:
             own_picture(self.file)
         if (why := self._why_at_end(state)) is not None:
@@ -218,7 +218,7 @@ class Resume:
                 print(f"picture  {pictures.show(self.file).save(own_picture(self.file))}")
             return
         use_threads(self.threads, state.colonies)
-        recorder = Recorder(self.file, scene, every=every, append=True, changed=self.changed)
+        recorder = Recorder(self.file, scene, append=True, changed=self.changed)
         go(
             scene.bind(state=state, per_colony=True),
             state,

@@ -259,7 +259,7 @@ class Medium(Effect):
             given[f"reservoir of {name}"] = signal.reservoir
             for axis, pair in zip("xyz", self.boundary_of(name).pairs, strict=True):
                 for end, face in zip(("low", "high"), pair, strict=True):
-                    given[f"the {end} face along {axis} of {name}"] = face.outside_value()
+                    given[f"{end} face along {axis} of {name}"] = face.outside_value()
         return {what: x for what, x in given.items() if isinstance(x, Schedule)}
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import Binding
-from torchfilm.effects.medium_values import Corner, on_grid, without_cells
-from torchfilm.effects.scaled import Scaled, scaled
+from torchfilm.effects.medium_values import Corner, later, on_grid, without_cells
+from torchfilm.effects.scaled import held_tensors, scaled
 from torchfilm.resolver import snapshot
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.grid import Grid, GridBatch
@@ -111,6 +111,7 @@ class Transport:
         self._reservoirs = schedules([x.reservoir for x in signals.values()])
         self._known: dict[tuple[int, ...], Constants] = {}
         self._spaces: dict[Any, dict[str, Any]] = {}
+        self._latest: dict[str, tuple[Any, Held]] = {}  # and when
         # signals that take turns with circuits, in the medium's steps; that others move, by whom
         self.in_turns: frozenset[str] = frozenset()
         self.coupled: dict[str, str] = {}
@@ -141,17 +142,21 @@ class Transport:
     def _space(self, state: State) -> dict[str, Any]:
         """What of a layout the scene decides, whatever grid a state has."""
         held = _held(self._reservoirs, state)
-        key = _key(held)
-        if key not in self._spaces:
-            signals, medium = self._given[0], self.medium
-            given = {name: x.reservoir for name, x in signals.items()}
-            beyond = mean_of(given, list(held.values()))
+        signals, medium = self._given[0], self.medium
+        given = {name: x.reservoir for name, x in signals.items()}
+        # what carries a gradient serves one backward pass
+        now = mean_of(given, list(held.values()))
+        wanted = len(held) > 1 and tracked(*(x for x in now.values() if isinstance(x, Tensor)))
+        key = (_key(held), torch.is_grad_enabled())
+        if key not in self._spaces or wanted:
             made = {
                 "periodic": self._given[2][next(iter(signals))].periodic,
                 "height": medium.height,
                 "obstacle": medium.obstacles,
-                "reservoir": beyond if medium.outside == "reservoir" else None,
+                "reservoir": now if medium.outside == "reservoir" else None,
             }
+            if wanted:
+                return made
             _keep(self._spaces, key, made)
         return self._spaces[key]
 
@@ -178,8 +183,17 @@ class Transport:
         mover = self.coupled.get(name)  # nutrition has moved it over the step, circuits will
         turns = self.medium.steps if name in self.in_turns else 1
         half = 0.5 * dt / turns if self.medium.halves else 0.0
-        time = state.time + {"nutrition": dt, "circuits": 0.0, None: half}[mover]
-        return without_cells(self._given[0][name], name, state, self.corner, time)
+        hours = {"nutrition": dt, "circuits": 0.0, None: half}[mover]
+        signal = self._given[0][name]
+        value = without_cells(signal, name, state, self.corner, state.time)
+        held = _held(schedules(signal.source), state).values()
+        # transport has had the mean source of the step so far
+        sources = [
+            share * self.values(self.at(time), name, "source", state) for share, time in held
+        ]
+        return later(
+            value, sum(sources[1:], sources[0]), signal.decay, name, state, self.corner, hours
+        )
 
     def carried(
         self,
@@ -236,8 +250,9 @@ class Transport:
         """Whether derivatives by what a signal's transport depends on are wanted."""
         each = [self.at(time) for _, time in self._held(name, state).values()]
         numbers = [x for now in each for x in now.numbers(name) if isinstance(x, Tensor)]
-        functions = [_closure_tensors(now.signals[name], now.flows[name]) for now in each]
-        return tracked(*numbers, *(x for found in functions for x in found))
+        given = [(now.signals[name], now.flows[name]) for now in each]
+        functions = [f for s, flow in given for f in (s.decay, s.source, flow) if callable(f)]
+        return tracked(*numbers, *(x for f in functions for x in held_tensors(f)))
 
     def carrier(self, name: str, state: State, batch: GridBatch, dt: float) -> Carrier:
         """The step of a signal on grids of one shape; it is reused while the grids stay."""
@@ -262,7 +277,10 @@ class Transport:
 
     def _held(self, name: str, state: State) -> Held:
         """Which values of the schedules by which a signal moves hold in a step."""
-        return _held(self._moving[name], state)
+        when = state.time if state.span is None else state.span
+        if (known := self._latest.get(name)) is None or known[0] != when:
+            known = self._latest[name] = when, _held(self._moving[name], state)
+        return known[1]
 
     @contextmanager
     def one_step(self) -> Iterator[None]:
@@ -412,21 +430,6 @@ def _velocity(flow: Flow, layout: Layout, batch: GridBatch, own: Callable[[Any],
         -1, 1, 1, 1
     )
     return tuple(scaled(flow, found, factor) for found in layout.on_faces(flow, batch))
-
-
-def _closure_tensors(signal: Signal, flow: Flow) -> list[Tensor]:
-    """Tensors in the closures of functions of positions."""
-    functions = [f for f in (signal.decay, signal.source, flow) if callable(f)]
-    return [x for f in functions for x in held_tensors(f)]
-
-
-def held_tensors(function: Callable[..., Any]) -> list[Tensor]:
-    """Tensors in the closure of a function, and by which it is scaled."""
-    if isinstance(function, Scaled):
-        factor = [function.factor] if isinstance(function.factor, Tensor) else []
-        return [*factor, *held_tensors(function.function)]
-    cells = getattr(function, "__closure__", None) or ()
-    return [cell.cell_contents for cell in cells if isinstance(cell.cell_contents, Tensor)]
 
 
 def _first_values(

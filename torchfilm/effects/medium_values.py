@@ -155,6 +155,16 @@ def without_cells(signal: Signal, name: str, state: State, corner: Corner, time:
     return (value * kept**n + made * again) * rest_kept + rest_made
 
 
+def later(
+    value: Tensor, source: Tensor, decay: Any, name: str, state: State, corner: Corner, hours: float
+) -> Tensor:
+    """What some values on every voxel, (nodes,), have become after some hours with one source,
+    (nodes,), where nothing else acts on them."""
+    rate = on_grid(decay, name, "decay", state, corner)
+    kept, made = _over([0.0], [source], rate, value, hours)
+    return value * kept + made
+
+
 def _over(
     times: Sequence[float], sources: Sequence[Tensor], rate: Tensor, like: Tensor, span: float
 ) -> tuple[Tensor, Tensor]:

@@ -44,3 +44,12 @@ def scaled(given: Any, found: Tensor, factor: Callable[[checks.Value], Any]) -> 
     """What a function of positions gave, `found`, times the factor if it is `Scaled`. factor: from
     one number, or one per colony, to numbers that stand beside those found."""
     return found * factor(given.factor) if isinstance(given, Scaled) else found
+
+
+def held_tensors(function: Callable[..., Any]) -> list[Tensor]:
+    """Tensors in the closure of a function, and by which it is scaled."""
+    if isinstance(function, Scaled):
+        factor = [function.factor] if isinstance(function.factor, Tensor) else []
+        return [*factor, *held_tensors(function.function)]
+    cells = getattr(function, "__closure__", None) or ()
+    return [cell.cell_contents for cell in cells if isinstance(cell.cell_contents, Tensor)]

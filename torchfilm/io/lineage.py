@@ -274,7 +274,8 @@ class Lineage:
         self, colony: int | None = None, *, time: float | None = None
     ) -> dict[int, int]:
         """How many living cells descend from each founder of a colony, by its uid; 0 for a line
-        that has died out. time: h, by default that of the last frame."""
+        that has died out. time: h, by default that of the last frame; what was added or removed
+        by hand at that hour counts as done, after its frame."""
         when = self.now
         if time is not None:
             when = checks.number("clone_sizes(time)", time, least=self.begin, most=self.now)

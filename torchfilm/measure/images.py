@@ -57,17 +57,17 @@ def image(
     found = torch.stack([x.reshape(state.colonies, *raster.shape) for x in pages], 1)
     shapes = state.position, state.axis, state.length, state.radius
     if tracked(*shapes):
-        found = _FixedPlaces.apply(found, *shapes)
+        found = found + _FixedPlaces.apply(*shapes).cpu()
     return found.to(state.device)
 
 
 class _FixedPlaces(torch.autograd.Function):
-    """Images as they are, whose derivatives by where cells are would be wrong without a word: a
-    pixel is within a cell or not."""
+    """0, whose derivative by where cells are raises: that of an image would be wrong without a
+    word, since a pixel is within a cell or not."""
 
     @staticmethod
-    def forward(ctx: Any, images: Tensor, *shapes: Tensor) -> Tensor:
-        return images.view_as(images)
+    def forward(ctx: Any, *shapes: Tensor) -> Tensor:
+        return shapes[0].new_zeros((), dtype=torch.float64)
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
@@ -81,8 +81,8 @@ class _FixedPlaces(torch.autograd.Function):
 def _no_derivative() -> checks.InputError:
     return checks.InputError(
         "measure.image has derivatives by quantities of cells and by nothing else, and a derivative"
-        " is wanted that passes places, lengths or radii, too. Let it see fixed ones (an image of"
-        " state.detach()), or take a measure with derivatives by them, such as measure.profile."
+        " is wanted that passes places, lengths or radii, too. Let it see fixed ones, as by"
+        " image(state.detach(), [state.gfp], …), or take another measure, such as measure.profile."
     )
 
 

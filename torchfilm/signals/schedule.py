@@ -101,19 +101,19 @@ class Schedule(metaclass=checks.KnownKeywords):
     def shares(self, begin: float, end: float) -> list[tuple[int, float]]:
         """Which of the values hold from one time to another, h, each with its share of that time;
         the shares are together 1."""
-        hours, found = end - begin, dict.fromkeys(range(len(self.times)), 0.0)
+        hours = end - begin
+        found: dict[int, float] = {}
         edge = end - ROUNDING * max(1.0, abs(end))
         if self.period is not None and hours > self.period:
             whole = math.floor(hours / self.period)
-            for k, length in enumerate(self._lengths):
-                found[k] += whole * length
+            found = {k: whole * length for k, length in enumerate(self._lengths)}
             begin += whole * self.period
         while begin < edge:
             k = self.place(begin)
             upto = min(self._next(begin, k), end)
-            found[k] += (end if upto >= edge else upto) - begin
+            found[k] = found.get(k, 0.0) + (end if upto >= edge else upto) - begin
             begin = upto
-        if not (held := [(k, x) for k, x in found.items() if x > 0]):
+        if not (held := [(k, x) for k, x in sorted(found.items()) if x > 0]):
             return [(self.place(begin), 1.0)]
         return [(k, x / hours) for k, x in held] if len(held) > 1 else [(held[0][0], 1.0)]
 
@@ -128,8 +128,8 @@ class Schedule(metaclass=checks.KnownKeywords):
         if self.period is None:
             return self.times[place + 1] if place + 1 < len(self.times) else math.inf
         after = time + ROUNDING * max(1.0, abs(time))
-        ends = (*self.times[1:], self.period)
-        return after - after % self.period + ends[place]
+        end = self.times[place + 1] if place + 1 < len(self.times) else self.period
+        return after - after % self.period + end
 
     def changes(self, begin: float, end: float) -> list[float]:
         """When its values change between two times, h."""
@@ -225,6 +225,8 @@ def held_together(
     """Which values of some schedules hold at once from one time to another, h, by their places:
     with the share of that time, and a time, h, at which they do."""
     each: dict[tuple[int, ...], tuple[float, float]] = {}
+    if end <= begin:  # a step of no time, as one that is tried
+        return {tuple(x.place(begin) for x in schedules): (1.0, begin)}
     if len(schedules) == 1:
         of = schedules[0]
         each = {(k,): (share, of.times[k]) for k, share in of.shares(begin, end)}
