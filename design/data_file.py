@@ -79,10 +79,13 @@ def replacing(
             f"could not write {path}: another process is writing it. Give each process a file of"
             f" its own. The file keeps the {kept}."
         ) from error
-    except OSError as error:
+    except tf.SimulationError:
+        raise
+    except (OSError, RuntimeError) as error:  # HDF5 raises both
         beside.unlink(missing_ok=True)
         raise tf.SimulationError(
-            f"could not write {path}: {error}. Is the disk full? The file keeps the {kept}."
+            f"could not write {path}: {error}. Is the disk full, or a quota reached? The file keeps"
+            f" the {kept}."
         ) from error
 
 

@@ -170,9 +170,22 @@ def _run_guarded(
         return error
 
 
+def _is_of_pickling(task: Task, error: Exception) -> bool:
+    """Whether an executor failed because a worker cannot get the task, and not by itself."""
+    if isinstance(error, (pickle.PicklingError, ImportError)) or "Can't get" in str(error):
+        return True
+    if not isinstance(error, (AttributeError, TypeError)):
+        return False
+    try:
+        pickle.dumps(task)
+    except Exception:
+        return True
+    return False
+
+
 def _check_pickled(task: Task, error: Exception) -> None:
     """Raises InputError where an executor failed because the task cannot be pickled."""
-    if isinstance(error, (pickle.PicklingError, AttributeError, TypeError, ImportError)):
+    if _is_of_pickling(task, error):
         function = task.family.function
         name = getattr(function, "__qualname__", repr(function))
         raise tf.InputError(

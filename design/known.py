@@ -91,7 +91,10 @@ def _point(design: Any, task: Task) -> np.ndarray:
     values = design if not isinstance(values, Mapping) else values
     if not isinstance(values, Mapping):
         raise checks.input_error(
-            "start", design, "values by name, such as {'k3': 1.0}, a Best, a study, or a file"
+            "start",
+            design,
+            "values by name, such as {'k3': 1.0}, a Best, a study, or a file; in a"
+            " list values and Bests alone",
         )
     allowed = inspect.signature(task.family.function).parameters
     if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in allowed.values()):

@@ -3,6 +3,7 @@ and what the method learns from it."""
 
 from __future__ import annotations
 
+import copy
 import time
 from dataclasses import dataclass, replace
 
@@ -80,15 +81,17 @@ class Proposal:
         """Let a method learn the whole batch. Methods that never ask for slopes or residuals need
         not take any."""
         assert self.entry is not None
-        found = self.entry.loss if self.entry.goals is None else self.entry.goals
+        # a method may change what it is told, and the study must not change with it
+        of_method = copy.deepcopy
+        found = of_method(self.entry.loss if self.entry.goals is None else self.entry.goals)
         if self.known:
             know = getattr(method, "know", None)
             if know is not None:
-                know(self.entry.points, found)
+                know(of_method(self.entry.points), found)
             return
         batch = replace(self.batch, points=self.entry.points)
-        slopes = (self.entry.slopes,) if batch.slopes else ()
-        more = {"residuals": self.entry.residuals} if batch.residuals else {}
+        slopes = (of_method(self.entry.slopes),) if batch.slopes else ()
+        more = {"residuals": of_method(self.entry.residuals)} if batch.residuals else {}
         method.tell(batch, found, *slopes, **more)
 
 
@@ -114,7 +117,9 @@ def repeat_study(
         ):
             raise tf.InputError(
                 f"{study.path}: the method proposes other points than its batch {k} holds; another"
-                " version of the method may have made the file. Start a new study."
+                " version of the method may have made the file. A method of your own draws from"
+                " numbers by seed and batch, or has `recall`. Another study goes on with what this"
+                f" one knows by start={str(study.path)!r}."
             )
         if not proposal.complete:
             return proposal

@@ -20,7 +20,7 @@ from design.growing import FinishedColonies, grow
 from design.parameters import Value
 from design.scene_family import UnfitDesign, why_rough
 from design.slopes import Slopes, joined
-from design.targets.base import Target
+from design.targets.base import Target, check_squares
 from design.targets.goals import Goals
 from design.task import Task
 
@@ -371,11 +371,12 @@ def _scores(target: Target, finished: FinishedColonies) -> np.ndarray:
     """The losses of finished colonies, (B,)."""
     count = finished.state.colonies
     found = target.loss(finished.state, finished.history)
-    if not isinstance(found, torch.Tensor) or found.shape != (count,):
+    if not isinstance(found, torch.Tensor) or found.shape != (count,) or found.is_complex():
         raise TypeError(
             f"{type(target).__name__}.loss must return a tensor of shape ({count},), one number for"
             " each colony"
         )
+    check_squares(target, finished.state, finished.history, found)
     return found.double().cpu().numpy()
 
 

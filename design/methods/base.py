@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from scipy.stats import qmc
+from torch import Tensor
 
 from design.slopes import Slopes
 from torchfilm import checks
@@ -46,7 +47,10 @@ class Batch:
     residuals: bool = False
 
     def __post_init__(self) -> None:
-        points = np.array(self.points, dtype=np.float64)
+        given = self.points
+        points = np.array(
+            given.detach().cpu().numpy() if isinstance(given, Tensor) else given, dtype=np.float64
+        )
         if points.ndim != 2 or not len(points):
             raise checks.input_error(
                 "Batch.points", points.shape, "of shape (n, D) with n at least 1"

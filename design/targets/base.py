@@ -327,6 +327,25 @@ def huber(apart: Tensor) -> Tensor:
     return torch.where(size > FAR, apart.sign() * beyond, apart)
 
 
+def check_squares(target: Target, state: tf.State, history: Tensor | None, loss: Tensor) -> None:
+    """Raises TypeError, as this is no fault of a design, where the squares of the residuals of a
+    target of the user's do not add up to its loss (B,): least squares would lead elsewhere."""
+    if type(target).__module__.split(".")[0] == "design" or not target.squares:
+        return
+    found = target.residuals(state, history)
+    if found is None:
+        return
+    squares, loss = found.detach().double().square().sum(1), loss.detach().double()
+    off = ~((squares - loss).abs() <= 1e-4 * loss.abs().clamp(min=1.0))
+    bad = torch.nonzero(off & loss.isfinite() & (loss <= target.failed)).squeeze(1)
+    if bad.numel():
+        one, other = (float(x[bad[0]]) for x in (squares, loss))
+        raise TypeError(
+            f"{type(target).__name__}.residuals: their squares add up to {one:g} in a colony with a"
+            f" loss of {other:g}. They must add up to the loss of each colony."
+        )
+
+
 def requiring_gradients(state: tf.State, names: Iterable[str]) -> tf.State:
     """A copy of a state whose fields of these names require a gradient, if they are numbers with
     one."""

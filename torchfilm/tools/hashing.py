@@ -7,12 +7,13 @@ import dis
 import hashlib
 import re
 import sys
+import sysconfig
 from collections.abc import Iterator, Mapping
-from functools import partial
+from functools import cache, partial
 from inspect import unwrap
 from pathlib import Path
-from types import CodeType, FunctionType, MethodType
-from typing import Any
+from types import CodeType, FunctionType, MethodType, ModuleType
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -29,10 +30,11 @@ def digest(*things: Any) -> str:
 
     Lists and tuples count as equal if their items do, and floats of any precision if their values
     do. A function counts by its code, its defaults, its closure and the globals of its own module
-    that it uses. Its name, line numbers and docstring do not count. An object of a user's class
-    counts by its attributes and methods, a torch.nn module by its form and its weights, wherever it
-    is defined. Names imported from other modules are not followed. Different versions of Python may
-    compile one function in different ways, and so give different digests.
+    that it uses; so do functions, numbers and texts that come from other modules of the user's, but
+    not from installed packages. Its name, line numbers and docstring do not count. An object of a
+    user's class counts by its attributes and those of its class, with methods and properties, a
+    torch.nn module by its form and its weights, wherever it is defined. Different versions of
+    Python may compile one function in different ways, and so give different digests.
     """
     return _Word(weights=True).of(things)
 
@@ -90,7 +92,7 @@ class _Word:
 
     def __init__(self, *, weights: bool):
         self.weights, self.hasher = weights, hashlib.sha256()
-        #: the numbers of the objects of users' classes that were met before, by their ids
+        #: the numbers of what refers to others and was met before, by their ids
         self.met: dict[int, int] = {}
 
     def of(self, thing: Any) -> str:
@@ -113,7 +115,7 @@ class _Word:
         if id(thing) in enclosing:  # an object that contains itself, such as a recursive function
             self.hasher.update(b"again;")
             return
-        if _is_plain_object(thing):  # objects that refer to one another have many ways to each
+        if _refers_to_others(thing):  # there may be many ways to each
             if id(thing) in self.met:
                 self.hasher.update(f"object {self.met[id(thing)]} again;".encode())
                 return
@@ -160,6 +162,8 @@ def _parts(thing: Any, *, weights: bool) -> list[Any]:
         return list(thing)
     if isinstance(thing, (set, frozenset)):
         return sorted(map(repr, thing))
+    if isinstance(thing, type) and _of_user(thing.__module__):
+        return [thing.__qualname__, *_of_class(thing)]
     if (
         isinstance(thing, type)
         or not (hasattr(thing, "__dict__") or _slots(thing))
@@ -181,15 +185,26 @@ def _parts(thing: Any, *, weights: bool) -> list[Any]:
         given = [x for name, value in held.items() for x in (name, value)]
     # a user's class also counts by its functions
     own = [c for c in kind.__mro__ if c.__module__.split(".")[0] not in OURS]
-    return [
-        kind.__qualname__,
-        *given,
-        *(x for c in own for x in vars(c).values() if isinstance(x, OF_CLASSES)),
-    ]
+    return [kind.__qualname__, *given, *(x for c in own for x in _of_class(c))]
 
 
-# What counts of a user's class, besides the attributes of the object.
-OF_CLASSES = (FunctionType, torch.nn.Module, torch.Tensor)
+def _of_class(kind: type) -> list[Any]:
+    """What counts of a user's class: its methods and properties, and plain values by name."""
+    found: list[Any] = []
+    for name, x in vars(kind).items():
+        if isinstance(x, property):
+            found += [f for f in (x.fget, x.fset) if f is not None]
+        elif isinstance(x, (staticmethod, classmethod)):
+            found.append(x.__func__)
+        elif isinstance(x, (FunctionType, torch.nn.Module, torch.Tensor)):
+            found.append(x)
+        elif isinstance(x, PLAIN) and not name.startswith("__") and name != "_abc_impl":
+            found += [name, x]
+    return found
+
+
+# What counts as it is, wherever it stands.
+PLAIN = (str, int, float, bool, tuple, list, dict, np.ndarray, torch.Tensor)
 # What torch keeps in each module: its parts, and hooks and the like, which do not count.
 OF_MODULES = frozenset(vars(torch.nn.Module()))
 
@@ -243,11 +258,16 @@ def _script(name: str, thing: object = None) -> str:
     return name if in_notebook else Path(file).stem
 
 
-def _is_plain_object(thing: Any) -> bool:
-    """Whether it is an object of a class of a user's, but no dataclass."""
+def _refers_to_others(thing: Any) -> bool:
+    """Whether it is a class of a user's, an object of one that is no dataclass, or a function that
+    uses functions or classes."""
     kind = type(thing)
+    if isinstance(thing, FunctionType):
+        return any(isinstance(x, (FunctionType, type)) for x in _globals(thing))
+    if isinstance(thing, type):
+        return _of_user(thing.__module__)
     return not (
-        isinstance(thing, (FunctionType, MethodType, CodeType, partial, type, Mapping, tuple, list))
+        isinstance(thing, (MethodType, CodeType, partial, Mapping, tuple, list))
         or dataclasses.is_dataclass(thing)
         or kind.__module__.split(".")[0] in OURS
     )
@@ -268,9 +288,10 @@ def _slots(thing: Any) -> dict[str, Any]:
 
 
 def _globals(function: FunctionType) -> list[Any]:
-    """The numbers, texts, arrays, dataclasses, and the functions and objects of its own module
-    that a function uses."""
+    """The numbers, texts, arrays, dataclasses, and the functions and objects of its own and other
+    modules of the user's that a function uses."""
     names: list[str] = []
+    attributes: set[str] = set()
     codes = [function.__code__]
     while codes:
         code = codes.pop()
@@ -278,17 +299,34 @@ def _globals(function: FunctionType) -> list[Any]:
             i.argval for i in dis.get_instructions(code) if i.opname in ("LOAD_GLOBAL", "LOAD_NAME")
         ]
         codes += [c for c in code.co_consts if isinstance(c, CodeType)]
+        attributes |= {*code.co_names}
     used = [function.__globals__.get(name) for name in dict.fromkeys(names)]
-    plain = (str, int, float, bool, tuple, list, dict, np.ndarray, torch.Tensor)
+    for module in [x for x in used if isinstance(x, ModuleType) and _of_user(x.__name__)]:
+        used += [vars(module)[n] for n in sorted(attributes & vars(module).keys())]
+    mine = lambda x: x.__module__ == function.__module__ or _of_user(x.__module__)
+    wrapped = lambda x: callable(x) and isinstance(getattr(x, "__wrapped__", None), FunctionType)
     return [
-        x
+        unwrap(cast(Any, x)) if wrapped(x) else x
         for x in used
-        if isinstance(x, plain)
+        if isinstance(x, PLAIN)
         or (dataclasses.is_dataclass(x) and not isinstance(x, type))
-        or (isinstance(x, FunctionType) and x.__module__ == function.__module__)
+        or ((isinstance(x, (FunctionType, type)) or wrapped(x)) and mine(x))
         or isinstance(x, torch.nn.Module)
-        or type(x).__module__ == function.__module__
+        or mine(type(x))
     ]
+
+
+@cache
+def _of_user(name: str | None) -> bool:
+    """Whether a module is a file of the user's: neither of Python nor of an installed package."""
+    file = getattr(sys.modules.get(name or ""), "__file__", None)
+    if not name or name.split(".")[0] in OURS or file is None or Path(file).suffix != ".py":
+        return False
+    path, installed = Path(file).resolve(), {sysconfig.get_path(k) for k in INSTALLED}
+    return not any(path.is_relative_to(Path(root).resolve()) for root in installed)
+
+
+INSTALLED = ("stdlib", "platstdlib", "purelib", "platlib")
 
 
 def _is_empty(cell: Any) -> bool:
