@@ -79,7 +79,7 @@ def replacing(
             f"could not write {path}: another process is writing it. Give each process a file of"
             f" its own. The file keeps the {kept}."
         ) from error
-    except tf.SimulationError:
+    except (tf.SimulationError, NotImplementedError, RecursionError):
         raise
     except (OSError, RuntimeError) as error:  # HDF5 raises both
         beside.unlink(missing_ok=True)

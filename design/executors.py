@@ -172,12 +172,14 @@ def _run_guarded(
 
 def _is_of_pickling(task: Task, error: Exception) -> bool:
     """Whether an executor failed because a worker cannot get the task, and not by itself."""
-    if isinstance(error, (pickle.PicklingError, ImportError)) or "Can't get" in str(error):
+    if isinstance(error, (pickle.PicklingError, ImportError)):
         return True
     if not isinstance(error, (AttributeError, TypeError)):
         return False
+    if "Can't get attribute" in str(error):  # of a worker that has other code
+        return True
     try:
-        pickle.dumps(task)
+        pickle.loads(pickle.dumps(task))
     except Exception:
         return True
     return False

@@ -104,7 +104,7 @@ def repeat_study(
     recall = getattr(method, "recall", None)
     for k, entry in enumerate(study.entries):
         if recall is not None:  # of the last batch it may have grown only a part
-            recall(entry.points if k < len(study.entries) - 1 else None)
+            recall(entry.points.copy() if k < len(study.entries) - 1 else None)
         proposal = Proposal.of_number(k, method, task, known)
         proposal.entry = entry
         wanted = proposal.batch.points[: proposal.done]

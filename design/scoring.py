@@ -242,6 +242,7 @@ def _grow_and_score(
             unfit = np.array(_unfit(task, event.state, size))[first].tolist()
             reasons |= {divmod(k, replicates): w for k, w in zip(ids, unfit, strict=True) if w}
             good = np.isfinite(score) & np.array([not why for why in unfit])
+            check_squares(task.target, event.state, event.history, score, first, good)
             losses[ids] = np.where(good, score, task.target.failed)
             if isinstance(task.target, Goals):
                 each = task.target.losses(event.state, event.history).cpu().numpy()[first]
@@ -376,7 +377,6 @@ def _scores(target: Target, finished: FinishedColonies) -> np.ndarray:
             f"{type(target).__name__}.loss must return a tensor of shape ({count},), one number for"
             " each colony"
         )
-    check_squares(target, finished.state, finished.history, found)
     return found.double().cpu().numpy()
 
 

@@ -327,22 +327,30 @@ def huber(apart: Tensor) -> Tensor:
     return torch.where(size > FAR, apart.sign() * beyond, apart)
 
 
-def check_squares(target: Target, state: tf.State, history: Tensor | None, loss: Tensor) -> None:
+def check_squares(
+    target: Target, state: tf.State, history: Tensor | None, loss: np.ndarray, first: Any, good: Any
+) -> None:
     """Raises TypeError, as this is no fault of a design, where the squares of the residuals of a
-    target of the user's do not add up to its loss (B,): least squares would lead elsewhere."""
-    if type(target).__module__.split(".")[0] == "design" or not target.squares:
+    target of the user's do not add up to its loss: least squares would lead elsewhere.
+
+    loss: (n,) of the colonies `first` (n,), of which those that count are `good` (n,). Residuals of
+    a course are not looked at."""
+    own = type(target).__module__.split(".")[0] != "design"
+    if not (own and target.squares and type(target).course is Target.course and good.any()):
         return
-    found = target.residuals(state, history)
+    found, name = target.residuals(state, history), type(target).__name__
     if found is None:
         return
-    squares, loss = found.detach().double().square().sum(1), loss.detach().double()
-    off = ~((squares - loss).abs() <= 1e-4 * loss.abs().clamp(min=1.0))
-    bad = torch.nonzero(off & loss.isfinite() & (loss <= target.failed)).squeeze(1)
-    if bad.numel():
-        one, other = (float(x[bad[0]]) for x in (squares, loss))
+    if not isinstance(found, Tensor) or found.dim() != 2 or len(found) != state.colonies:
+        raise TypeError(f"{name}.residuals must return a tensor of shape ({state.colonies}, K)")
+    squares = found.detach().double().square().sum(1).cpu().numpy()[first]
+    bad = good & ~(np.abs(squares - loss) <= 1e-4 * np.maximum(1.0, np.abs(loss)))
+    if bad.any():
+        at = int(bad.argmax())
         raise TypeError(
-            f"{type(target).__name__}.residuals: their squares add up to {one:g} in a colony with a"
-            f" loss of {other:g}. They must add up to the loss of each colony."
+            f"{name}.residuals: their squares add up to {squares[at]:g} in a colony with a loss of"
+            f" {loss[at]:g}. They must add up to the loss; a loss that has no such form has"
+            " residuals that return None."
         )
 
 

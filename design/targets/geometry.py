@@ -194,21 +194,29 @@ def draw_region(ax: Axes, state: tf.State, place: int, level: Tensor, colour: st
     window = ax.get_xlim(), ax.get_ylim()
     # each pixel is of the cell whose centreline is nearest, if that is near
     radius, length = state.radius[mine].max(), state.length[mine]
-    many = max(2, 1 + math.ceil(float(length.max() / radius)))  # points on a centreline
-    along = torch.linspace(-0.5, 0.5, many, dtype=state.dtype, device=state.device)
-    middle, axis = state.position[mine, :2].to(state.dtype), state.axis[mine, :2]
-    lines = (middle + along.reshape(-1, 1, 1) * length.unsqueeze(1) * axis).reshape(-1, 2)
-    points, levels = lines.cpu().numpy(), level[mine].detach().repeat(many).cpu().numpy()
+    many = 2 + torch.ceil(length / radius).long()  # points on a centreline
+    row = torch.repeat_interleave(many)
+    within = torch.arange(len(row), device=row.device) - (many.cumsum(0) - many)[row]
+    along = ((within / (many[row] - 1) - 0.5) * length[row]).unsqueeze(1)
+    lines = state.position[mine, :2][row] + along * state.axis[mine, :2][row]
+    points, levels = lines.cpu().numpy(), level[mine].detach()[row].cpu().numpy()
     for name, (low, high) in ({} if state.space is None else state.space.faces).items():
         if name in "xy":  # with the images beyond both faces
             period = (high - low) * np.eye(2)["xy".index(name)]
             points = np.concatenate([points, points - period, points + period])
             levels = np.tile(levels, 3)
     step = max(PIXEL, *(abs(high - low) / MOST_PIXELS for low, high in window))
+    reach = 1.5 * float(radius) + step
+    near = [
+        (points[:, k] > min(w) - reach) & (points[:, k] < max(w) + reach)
+        for k, w in enumerate(window)
+    ]
+    points, levels = points[near[0] & near[1]], levels[near[0] & near[1]]
+    if not len(points):
+        return
     x, y = (np.arange(min(ends), max(ends) + step, step) for ends in window)
     grid = np.stack(np.meshgrid(x, y), -1)
     apart, nearest = cKDTree(points).query(grid.reshape(-1, 2))
-    reach = 1.5 * float(radius) + step
     lit = np.where(apart < reach, levels[nearest], 0.0).reshape(grid.shape[:2])
     lit = gaussian_filter(lit, 0.5 * reach / step)  # the ends of single cells are of no interest
     if lit.min() < 0.5 < lit.max():

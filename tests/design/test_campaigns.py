@@ -87,19 +87,27 @@ def test_a_batch_takes_a_tensor():
 HELPER = """
 from functools import lru_cache
 SCALE = {scale}
-class Knobs:
-    width = {width}
+def times(factor):
+    def decorate(function):
+        return lambda x: factor * function(x)
+    return decorate
+@times({width})
+def wide(x):
+    return x
 @lru_cache
 def gain(x):
     return {gain}
 def other(x):
     return x * SCALE
+def only(x):
+    return {only}
 """
 MODEL = """
 import {helper} as parts
-from {helper} import Knobs, gain, other
+from {helper} import gain, other, wide
 class Mean:
     wanted = {wanted}
+    _calls = {private}
     @property
     def half(self):
         return {half}
@@ -107,37 +115,70 @@ class Mean:
     def twice(x):
         return {twice}
     def __call__(self, x):
-        return self.wanted * x + other(x) + gain(x) + Knobs.width + parts.gain(1)
-def rates(x):
-    return other(x) + parts.gain(x)
+        return self.wanted * x + other(x) + gain(x) + wide(x) + parts.only(1)
 """
 PLAIN = {
-    "scale": 1.0,
-    "width": 2.0,
-    "gain": "x + 1",
-    "wanted": 1.0,
-    "half": "0.5",
-    "twice": "2 * x",
-}
+    "scale": 1.0, "width": 2.0, "gain": "x + 1", "wanted": 1.0, "half": 0.5, "twice": "2 * x",
+    "only": "x - 1", "private": 0,
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("changed", [None, "scale", "width", "gain", "wanted", "half", "twice"])
+@pytest.mark.parametrize("changed", [None, *PLAIN])
 def test_a_digest_counts_what_a_users_code_uses(changed, tmp_path, monkeypatch):
-    """Attributes, properties and static methods of its class, and modules of the user's."""
+    """Attributes, properties and static methods of its class, and functions of other files; also
+    where a file was run as a script, and not imported."""
     monkeypatch.syspath_prepend(tmp_path)
     found = []
     for k, value in enumerate((None, "7")):
         texts = {**PLAIN, **({changed: value} if changed and value else {})}
-        helper, model = f"own_helper_{changed}_{k}", f"own_model_{changed}_{k}"
-        (tmp_path / f"{helper}.py").write_text(HELPER.format(**texts))
+        model = f"own_model_{changed}_{k}"
         (tmp_path / f"{model}.py").write_text(MODEL.format(helper="own_helper", **texts))
         sys.modules.pop("own_helper", None)
         (tmp_path / "own_helper.py").write_text(HELPER.format(**texts))
         importlib.invalidate_caches()
         made = importlib.import_module(model)
         found.append(tf.digest(made.Mean()))
+        sys.modules.pop(model)
+        assert tf.digest(made.Mean()) == found[-1]
     sys.modules.pop("own_helper", None)
-    assert (found[0] != found[1]) == (changed is not None)
+    assert (found[0] != found[1]) == (changed not in (None, "private"))
+
+
+def test_functions_that_share_functions_are_counted_once():
+    """Thirty levels of two, each of which calls both of the next: 2³⁰ ways."""
+    lines = ["def f30(x): return x", "def g30(x): return x"]
+    for k in range(30):
+        lines += [f"def {n}{k}(x): return f{k + 1}(x) + g{k + 1}(x)" for n in "fg"]
+    words = []
+    for last in ("x", "x + 1"):
+        space = {"__name__": "__main__"}
+        exec("\n".join([*lines, f"def f30(x): return {last}"]), space)
+        words.append(tf.digest(space["f0"]))
+    assert words[0] != words[1]
+
+
+@dataclass(frozen=True)
+class Course(Target):
+    """Residuals of a course, which a plain evaluation does not note; too small colonies fail."""
+
+    differentiable = True
+    fewest = 100
+
+    def note(self, state):
+        return mean(state, "gfp").unsqueeze(1)
+
+    def course(self, state):
+        return mean(state, "gfp").unsqueeze(1).expand(-1, 2)
+
+    def residuals(self, state, history=None):
+        return history[:, :, 1].T
+
+    def loss(self, state, history=None):
+        return history[:, :, 0].square().sum(0)
+
+
+def test_residuals_of_a_course_are_left_to_it():
+    search(target=Course(), method="sobol", cells=4).run(colonies=4)
 
 
 class Broken:

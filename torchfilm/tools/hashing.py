@@ -7,13 +7,12 @@ import dis
 import hashlib
 import re
 import sys
-import sysconfig
 from collections.abc import Iterator, Mapping
 from functools import cache, partial
 from inspect import unwrap
 from pathlib import Path
 from types import CodeType, FunctionType, MethodType, ModuleType
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,11 +29,13 @@ def digest(*things: Any) -> str:
 
     Lists and tuples count as equal if their items do, and floats of any precision if their values
     do. A function counts by its code, its defaults, its closure and the globals of its own module
-    that it uses; so do functions, numbers and texts that come from other modules of the user's, but
-    not from installed packages. Its name, line numbers and docstring do not count. An object of a
-    user's class counts by its attributes and those of its class, with methods and properties, a
-    torch.nn module by its form and its weights, wherever it is defined. Different versions of
-    Python may compile one function in different ways, and so give different digests.
+    that it uses, and so do the functions that these name in other modules of the user's, which are
+    all but Python's and those of installed packages. Its name, line numbers and docstring do not
+    count. An object of a user's class counts by its attributes, and by its class's methods,
+    properties and plain values, but for names that begin with an underscore. A torch.nn module
+    counts by its form and its weights, wherever it is defined. Classes that a function names do not
+    count, nor what it imports as it runs. Different versions of Python may compile one function in
+    different ways, and so give different digests.
     """
     return _Word(weights=True).of(things)
 
@@ -115,17 +116,20 @@ class _Word:
         if id(thing) in enclosing:  # an object that contains itself, such as a recursive function
             self.hasher.update(b"again;")
             return
-        if _refers_to_others(thing):  # there may be many ways to each
-            if id(thing) in self.met:
-                self.hasher.update(f"object {self.met[id(thing)]} again;".encode())
-                return
+        if id(thing) in self.met:  # what refers to one another has many ways to each
+            self.hasher.update(f"object {self.met[id(thing)]} again;".encode())
+            return
+        if _is_plain_object(thing):
             self.met[id(thing)] = len(self.met)
         enclosing = enclosing | {id(thing)}
         # a list may have been a tuple before it was written to a file
         kind = "list" if isinstance(thing, tuple) else type(thing).__name__
         self.hasher.update(f"{kind}(".encode())
-        for part in _parts(thing, weights=self.weights):
+        parts = _parts(thing, weights=self.weights)
+        for part in parts:
             self._add(part, enclosing)
+        if isinstance(thing, FunctionType) and any(isinstance(x, FunctionType) for x in parts):
+            self.met[id(thing)] = len(self.met)
         self.hasher.update(b")")
 
 
@@ -162,8 +166,6 @@ def _parts(thing: Any, *, weights: bool) -> list[Any]:
         return list(thing)
     if isinstance(thing, (set, frozenset)):
         return sorted(map(repr, thing))
-    if isinstance(thing, type) and _of_user(thing.__module__):
-        return [thing.__qualname__, *_of_class(thing)]
     if (
         isinstance(thing, type)
         or not (hasattr(thing, "__dict__") or _slots(thing))
@@ -188,23 +190,38 @@ def _parts(thing: Any, *, weights: bool) -> list[Any]:
     return [kind.__qualname__, *given, *(x for c in own for x in _of_class(c))]
 
 
+# What counts as it is.
+PLAIN = (str, int, float, bool, tuple, list, dict, np.ndarray, torch.Tensor)
+
+
 def _of_class(kind: type) -> list[Any]:
-    """What counts of a user's class: its methods and properties, and plain values by name."""
+    """What counts of a class, besides the attributes of its objects."""
     found: list[Any] = []
+    mine = _of_user(kind.__module__)
     for name, x in vars(kind).items():
-        if isinstance(x, property):
-            found += [f for f in (x.fget, x.fset) if f is not None]
-        elif isinstance(x, (staticmethod, classmethod)):
-            found.append(x.__func__)
-        elif isinstance(x, (FunctionType, torch.nn.Module, torch.Tensor)):
+        if isinstance(x, (FunctionType, torch.nn.Module, torch.Tensor)):
             found.append(x)
-        elif isinstance(x, PLAIN) and not name.startswith("__") and name != "_abc_impl":
+        elif mine and isinstance(x, property):
+            found += [f for f in (x.fget, x.fset) if f is not None]
+        elif mine and isinstance(x, (staticmethod, classmethod)):
+            found.append(x.__func__)
+        # private ones may be counters and stores, which change as it runs
+        elif mine and isinstance(x, PLAIN) and not name.startswith("_"):
             found += [name, x]
     return found
 
 
-# What counts as it is, wherever it stands.
-PLAIN = (str, int, float, bool, tuple, list, dict, np.ndarray, torch.Tensor)
+def _of_user(name: str | None) -> bool:
+    """Whether a module is the user's: none of Python's, of ours, or of an installed package. A
+    script that was run, or a notebook, may have no file."""
+    root = (name or "").split(".")[0]
+    if root in OURS or root in sys.stdlib_module_names - {*SCRIPT}:
+        return False
+    file = getattr(sys.modules.get(name or ""), "__file__", None)
+    return file is None or not INSTALLED & {*Path(file).parts}
+
+
+INSTALLED = frozenset({"site-packages", "dist-packages"})
 # What torch keeps in each module: its parts, and hooks and the like, which do not count.
 OF_MODULES = frozenset(vars(torch.nn.Module()))
 
@@ -258,16 +275,11 @@ def _script(name: str, thing: object = None) -> str:
     return name if in_notebook else Path(file).stem
 
 
-def _refers_to_others(thing: Any) -> bool:
-    """Whether it is a class of a user's, an object of one that is no dataclass, or a function that
-    uses functions or classes."""
+def _is_plain_object(thing: Any) -> bool:
+    """Whether it is an object of a class of a user's, but no dataclass."""
     kind = type(thing)
-    if isinstance(thing, FunctionType):
-        return any(isinstance(x, (FunctionType, type)) for x in _globals(thing))
-    if isinstance(thing, type):
-        return _of_user(thing.__module__)
     return not (
-        isinstance(thing, (MethodType, CodeType, partial, Mapping, tuple, list))
+        isinstance(thing, (FunctionType, MethodType, CodeType, partial, type, Mapping, tuple, list))
         or dataclasses.is_dataclass(thing)
         or kind.__module__.split(".")[0] in OURS
     )
@@ -298,35 +310,30 @@ def _globals(function: FunctionType) -> list[Any]:
         names += [
             i.argval for i in dis.get_instructions(code) if i.opname in ("LOAD_GLOBAL", "LOAD_NAME")
         ]
-        codes += [c for c in code.co_consts if isinstance(c, CodeType)]
         attributes |= {*code.co_names}
+        codes += [c for c in code.co_consts if isinstance(c, CodeType)]
     used = [function.__globals__.get(name) for name in dict.fromkeys(names)]
-    for module in [x for x in used if isinstance(x, ModuleType) and _of_user(x.__name__)]:
-        used += [vars(module)[n] for n in sorted(attributes & vars(module).keys())]
+    seen: set[str] = set()
+    for module in used:  # it grows by what the function names of the modules in it
+        if isinstance(module, ModuleType) and module.__name__ not in seen:
+            seen.add(module.__name__)
+            if _of_user(module.__name__):
+                used += [vars(module)[n] for n in sorted(attributes & vars(module).keys())]
+    # of a function that functools keeps the results of, the function
+    used = [x.__wrapped__ if isinstance(x, CACHED) else x for x in used]
     mine = lambda x: x.__module__ == function.__module__ or _of_user(x.__module__)
-    wrapped = lambda x: callable(x) and isinstance(getattr(x, "__wrapped__", None), FunctionType)
     return [
-        unwrap(cast(Any, x)) if wrapped(x) else x
+        x
         for x in used
         if isinstance(x, PLAIN)
         or (dataclasses.is_dataclass(x) and not isinstance(x, type))
-        or ((isinstance(x, (FunctionType, type)) or wrapped(x)) and mine(x))
+        or (isinstance(x, FunctionType) and mine(x))
         or isinstance(x, torch.nn.Module)
-        or mine(type(x))
+        or type(x).__module__ == function.__module__
     ]
 
 
-@cache
-def _of_user(name: str | None) -> bool:
-    """Whether a module is a file of the user's: neither of Python nor of an installed package."""
-    file = getattr(sys.modules.get(name or ""), "__file__", None)
-    if not name or name.split(".")[0] in OURS or file is None or Path(file).suffix != ".py":
-        return False
-    path, installed = Path(file).resolve(), {sysconfig.get_path(k) for k in INSTALLED}
-    return not any(path.is_relative_to(Path(root).resolve()) for root in installed)
-
-
-INSTALLED = ("stdlib", "platstdlib", "purelib", "platlib")
+CACHED = type(cache(len))
 
 
 def _is_empty(cell: Any) -> bool:
