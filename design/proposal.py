@@ -81,17 +81,16 @@ class Proposal:
         """Let a method learn the whole batch. Methods that never ask for slopes or residuals need
         not take any."""
         assert self.entry is not None
-        # a method may change what it is told, and the study must not change with it
-        of_method = copy.deepcopy
-        found = of_method(self.entry.loss if self.entry.goals is None else self.entry.goals)
+        # copies: a method may write into the arrays that it gets, and the study must not change
+        found = copy.deepcopy(self.entry.loss if self.entry.goals is None else self.entry.goals)
         if self.known:
             know = getattr(method, "know", None)
             if know is not None:
-                know(of_method(self.entry.points), found)
+                know(self.entry.points.copy(), found)
             return
         batch = replace(self.batch, points=self.entry.points)
-        slopes = (of_method(self.entry.slopes),) if batch.slopes else ()
-        more = {"residuals": of_method(self.entry.residuals)} if batch.residuals else {}
+        slopes = (copy.deepcopy(self.entry.slopes),) if batch.slopes else ()
+        more = {"residuals": copy.deepcopy(self.entry.residuals)} if batch.residuals else {}
         method.tell(batch, found, *slopes, **more)
 
 

@@ -20,7 +20,7 @@ TWO = [Parameter("make", 0.1, 10.0, log=True), Parameter("decay", 0.1, 5.0)]
 
 
 class Changing:
-    """A method that writes into what it is told, as those do that scale losses in place."""
+    """A method that writes into the losses that it gets, as those do that scale losses in place."""
 
     def __init__(self, touch: bool):
         self.touch = touch

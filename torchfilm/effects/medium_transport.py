@@ -142,23 +142,22 @@ class Transport:
     def _space(self, state: State) -> dict[str, Any]:
         """What of a layout the scene decides, whatever grid a state has."""
         held = _held(self._reservoirs, state)
-        signals, medium = self._given[0], self.medium
-        given = {name: x.reservoir for name, x in signals.items()}
-        # what carries a gradient serves one backward pass
-        now = mean_of(given, list(held.values()))
-        wanted = len(held) > 1 and tracked(*(x for x in now.values() if isinstance(x, Tensor)))
         key = (_key(held), torch.is_grad_enabled())
-        if key not in self._spaces or wanted:
-            made = {
-                "periodic": self._given[2][next(iter(signals))].periodic,
-                "height": medium.height,
-                "obstacle": medium.obstacles,
-                "reservoir": now if medium.outside == "reservoir" else None,
-            }
-            if wanted:
-                return made
+        if (known := self._spaces.get(key)) is not None:
+            return known
+        signals, medium = self._given[0], self.medium
+        reservoir = mean_of({n: x.reservoir for n, x in signals.items()}, list(held.values()))
+        made = {
+            "periodic": self._given[2][next(iter(signals))].periodic,
+            "height": medium.height,
+            "obstacle": medium.obstacles,
+            "reservoir": reservoir if medium.outside == "reservoir" else None,
+        }
+        # a mean that carries a gradient serves one backward pass
+        numbers = [x for x in reservoir.values() if isinstance(x, Tensor)]
+        if len(held) == 1 or not tracked(*numbers):
             _keep(self._spaces, key, made)
-        return self._spaces[key]
+        return made
 
     def opened(self, state: State) -> State:
         """The state in the space of this medium, also where another model laid its grid."""
