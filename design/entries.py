@@ -47,6 +47,11 @@ class Entry:
         return len(self.streams)
 
     @property
+    def target_losses(self) -> np.ndarray:
+        """What a method learns: the losses (n,), or those of several targets (n, G)."""
+        return self.loss if self.goals is None else self.goals
+
+    @property
     def colonies(self) -> float:
         """Colonies simulated; one of another size counts as its share of the full size."""
         return len(self.points) * self.replicates * self.size * self.copies

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import ast
-import dataclasses
 import inspect
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,13 +12,15 @@ import numpy as np
 
 import torchfilm as tf
 from design.entries import Entry
-from design.parameters import Choice, Parameter, Value
+from design.known_studies import KnownStudy, joined, known_study, usual_value
+from design.parameters import Value
 from design.saved_design import read_design
 from design.study import Study
-from design.task import Task, TaskOptions
+from design.task import Task
 from torchfilm import checks
 
-MOST = 16  # designs of a study of another task that are grown again
+SAME = 1e-9  # two machines may round a coordinate in two ways
+WITH_LOSSES, GROWN = "designs, with their losses", "designs, grown again"
 
 
 class HasValues(Protocol):
@@ -31,43 +30,121 @@ class HasValues(Protocol):
     def values(self) -> Mapping[str, Value]: ...
 
 
-Start = HasValues | Mapping[str, Value] | Sequence[Any] | Study | str | Path
+Start = HasValues | Mapping[str, Value] | Study | str | Path | Sequence[Any]
 
 
 @dataclass(frozen=True, eq=False)
 class KnownDesigns:
-    """points (n, D) from which a search starts. entry: with their losses, where these hold for the
-    task of the search; None: they are grown again. why: they are, or "". known: designs of the
-    study from which they come; beyond: how many of them lie beyond the bounds."""
+    """Designs from which a search starts.
+
+    entry: those with losses that hold for the task of the search; points (n, D): those that are
+    grown; the first `given` of them are of no study. why: those of studies are grown again, or "".
+    remark: what a user should know of them. every (m, D): all that the studies know in the bounds.
+    """
 
     points: np.ndarray
     entry: Entry | None = None
+    given: int = 0
     why: str = ""
-    known: int = 0
-    beyond: int = 0
+    remark: str = ""
+    every: np.ndarray | None = None
 
     @property
-    def remark(self) -> str:
-        """What a user should know of the designs of a study: which are left out, and why."""
-        words = []
-        if self.beyond:
-            words.append(f"{self.beyond} of its {self.known} designs lie beyond the bounds")
-        if self.why:
-            words.append(
-                f"its losses do not hold here ({self.why}), so its {len(self.points)} best designs"
-                " are grown again"
-            )
-        return f"start: {'; '.join(words)}." if words else ""
+    def batches(self) -> list[np.ndarray]:
+        """The points (n, D) of each batch with which the study of the search begins."""
+        known = [] if self.entry is None else [self.entry.points]
+        return [*known, self.points] if len(self.points) else known
 
     def describe(self) -> str:
         """What a study says of them."""
-        kept = "with their losses" if self.entry else "grown again"
-        return f"{len(self.points)} designs, {kept}, {tf.digest(self.points.tolist())[:12]}"
+        kept = [] if self.entry is None else [f"{len(self.entry.points)} {WITH_LOSSES}"]
+        grown = [f"{len(self.points)} {GROWN}"] if len(self.points) else []
+        word = tf.digest(np.concatenate(self.batches).tolist())[:12]
+        return f"{', '.join(kept + grown)}, {word}"
+
+    def begun(self, study: Study) -> KnownDesigns:
+        """Those with which a study of the search began, where they are some of these: the files
+        from which these come have grown since. Else these, which `Study.check` compares."""
+        found = None if self.describe() == study.about.get("start") else _begun(study)
+        if found is None or self.every is None:
+            return self
+        began, now = (np.concatenate(of.batches) for of in (found, self))
+        every = np.concatenate([self.every, now])
+        if not _all_among(began, every) or not _all_among(self.points[: self.given], began):
+            return self
+        remark = "" if _all_among(now, began) else (
+            f"start: the study began with {len(began)} of these designs, and goes on with them;"
+            " those that came since are left out."
+        )  # fmt: skip
+        return replace(found, remark=remark)
+
+
+def _begun(study: Study) -> KnownDesigns | None:
+    """The designs with which a study began; None where it does not hold them all."""
+    said = study.about.get("start")
+    entries, entry, points = list(study.entries), None, np.empty((0, len(study.names)))
+    if not isinstance(said, str) or not entries:
+        return None
+    if WITH_LOSSES in said:
+        entry = entries.pop(0)
+    if GROWN in said and entries:
+        points = entries[0].points
+    if entry is None and not len(points):
+        return None
+    found = KnownDesigns(points, entry)
+    return found if found.describe() == said else None
+
+
+def _all_among(points: np.ndarray, every: np.ndarray) -> bool:
+    """Whether each of some points (n, D) is one of others (m, D)."""
+    return all(bool((np.abs(every - point) < SAME).all(1).any()) for point in points)
 
 
 def known_designs(given: Start, task: Task) -> KnownDesigns:
     """The designs that `Search.start` gives. Raises InputError for values that are missing, beyond
     the bounds or of no parameter, and for a file that is not one of a study or of a design."""
+    several = isinstance(given, Sequence) and not isinstance(given, str)
+    sources = [_source(one, task) for one in (given if several else [given])]  # type: ignore[union-attr]
+    values = [s for s in sources if isinstance(s, np.ndarray)]
+    studies = [s for s in sources if isinstance(s, KnownStudy)]
+    seen: set[bytes] = set()
+    kept: list[np.ndarray] = []
+    grown: list[np.ndarray] = list(values)
+    rows: list[tuple[Entry, int]] = []
+    for study in sorted(studies, key=lambda s: bool(s.why)):  # stable: those that hold first
+        new = [k for k in study.chosen if study.points[k].tobytes() not in seen]
+        seen |= {study.points[k].tobytes() for k in new}
+        (grown if study.why else kept).extend(study.points[k] for k in new)
+        rows += [study.rows[k] for k in new if not study.why]
+    if not kept and not grown:
+        many = sum(s.known for s in studies)
+        raise checks.input_error(
+            "start",
+            f"a study of {many} designs" if studies else given,
+            "one with a design within the bounds" if studies else "at least one design",
+        )
+    return KnownDesigns(
+        points=np.array(grown).reshape(-1, task.space.size),
+        entry=joined(np.array(kept), rows, task) if kept else None,
+        given=len(values),
+        why="; ".join(dict.fromkeys(s.why for s in studies if s.why)),
+        remark=_remark(studies),
+        every=np.concatenate([s.points for s in studies]) if studies else None,
+    )
+
+
+def _remark(studies: Sequence[KnownStudy]) -> str:
+    """What a user should know of the designs of studies, a line for each that has something."""
+    alone = len(studies) == 1
+    return "\n".join(
+        f"start: {s.remark}." if alone else f"start: {s.name}: {s.remark}."
+        for s in studies
+        if s.remark
+    )
+
+
+def _source(given: Any, task: Task) -> KnownStudy | np.ndarray:
+    """A study, or the coordinates (D,) of one design."""
     if isinstance(given, str | Path):
         path = Path(given)
         if not path.is_file():
@@ -75,13 +152,7 @@ def known_designs(given: Start, task: Task) -> KnownDesigns:
         given = (
             read_design(path)["parameters"] if path.suffix.lower() == ".json" else Study.read(path)
         )
-    if isinstance(given, Study):
-        return _of_study(given, task)
-    designs = given if isinstance(given, Sequence) else [given]
-    points = [_point(design, task) for design in designs]
-    if not points:
-        raise checks.input_error("start", given, "at least one design")
-    return KnownDesigns(np.array(points))
+    return known_study(given, task) if isinstance(given, Study) else _point(given, task)
 
 
 def _point(design: Any, task: Task) -> np.ndarray:
@@ -93,8 +164,7 @@ def _point(design: Any, task: Task) -> np.ndarray:
         raise checks.input_error(
             "start",
             design,
-            "values by name, such as {'k3': 1.0}, a Best, a study, or a file; in a"
-            " list values and Bests alone",
+            "values by name, such as {'k3': 1.0}, a Best, a study, a file, or a list of these",
         )
     allowed = inspect.signature(task.family.function).parameters
     if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in allowed.values()):
@@ -107,126 +177,8 @@ def _point(design: Any, task: Task) -> np.ndarray:
                     checks.suggestion(name, allowed),
                 )
     space = task.space
-    given = {n: values[n] if n in values else _usual(task, n) for n in space.names}
+    given = {n: values[n] if n in values else usual_value(task, n) for n in space.names}
     try:
         return space.point(given)
     except checks.InputError as error:
         raise checks.InputError(f"start: {error} Widen its bounds, or leave it out.") from error
-
-
-def _usual(task: Task, name: str) -> Value:
-    """The value that the scene function gives to an argument that is left out."""
-    found = inspect.signature(task.family.function).parameters.get(name)
-    usual = inspect.Parameter.empty if found is None else found.default
-    if isinstance(usual, bool | int | float | str):
-        return usual
-    raise checks.InputError(
-        f"start has no value for {name!r}, and the scene function has no default for it. Give"
-        f" start={{{name!r}: …}}."
-    )
-
-
-def _of_study(study: Study, task: Task) -> KnownDesigns:
-    """The designs of a study within the bounds: with their losses, if a search of this task with
-    the study's own parameters would be that study."""
-    full = [(e, k) for e in study.full() for k in range(len(e.loss))]
-    points, rows, added = [], [], {}
-    fixed = _literals(study.about.get("fixed", {}))
-    for name in task.space.names:
-        if name not in study.names:
-            added[name] = fixed[name] if name in fixed else _usual(task, name)
-    for entry, k in full:
-        try:
-            values = {**entry.values[k], **added}
-            points.append(task.space.point({name: values[name] for name in task.space.names}))
-            rows.append((entry, k))
-        except tf.InputError:  # beyond the bounds
-            continue
-    if not points:
-        raise checks.input_error(
-            "start", f"a study of {len(full)} designs", "one with a design within the bounds"
-        )
-    beyond = len(full) - len(points)
-    why = _why_other(study, task, fixed, added)
-    if why:
-        best = np.argsort([e.loss[k] for e, k in rows], kind="stable")[:MOST]
-        return KnownDesigns(np.array(points)[best], None, why, len(full), beyond)
-    join = lambda name: np.array([getattr(e, name)[k] for e, k in rows])
-    kept = lambda name: join(name) if all(getattr(e, name) is not None for e, _ in rows) else None
-    values_of = [task.space.values(point) for point in points]
-    entry = Entry(
-        points=np.array(points),
-        loss=join("loss"),
-        losses=join("losses"),
-        cells=join("cells"),
-        reasons={
-            (row, replicate): words
-            for row, (e, k) in enumerate(rows)
-            for (of, replicate), words in e.reasons.items()
-            if of == k
-        },
-        size=1.0,
-        seconds=0.0,
-        values=values_of,
-        streams=study.streams,
-        copies=0,
-        goals=kept("goals"),
-        each_goals=kept("each_goals"),
-    )
-    return KnownDesigns(entry.points, entry, "", len(full), beyond)
-
-
-def _why_other(
-    study: Study, task: Task, fixed: Mapping[str, Value], added: Mapping[str, Value]
-) -> str:
-    """Why the losses of a study do not hold for a task; "" where they do."""
-    gone = [name for name in study.names if name not in task.space.names]
-    if gone:
-        return f"it varies {gone[0]}, and this search does not"
-    options = {f.name: getattr(task, f.name) for f in dataclasses.fields(TaskOptions)}
-    stated = {n: v for n, v in added.items() if n in fixed}
-    try:
-        options["parameters"] = [
-            _as_here(read_parameter(text), task) for text in study.about["parameters"]
-        ]
-        options["fixed"] = {**task.family.fixed, **stated}
-        then = Task(**options).describe()
-    except (tf.InputError, ValueError, KeyError) as error:
-        return str(error)
-    differ = [name for name, value in then.items() if study.about.get(name) != value]
-    return f"another {', '.join(differ)}" if differ else ""
-
-
-def _as_here(parameter: Parameter | Choice, task: Task) -> Parameter | Choice:
-    """A parameter of a study; a choice reaches the scene as that of the same name in a task."""
-    here = next((p for p in task.space.parameters if p.name == parameter.name), None)
-    if not isinstance(parameter, Choice) or not isinstance(here, Choice):
-        return parameter
-    return Choice(
-        parameter.name, parameter.options, per_colony=here.per_colony, resolve=here.resolve
-    )
-
-
-def _literals(texts: Mapping[str, str]) -> dict[str, Value]:
-    """The values of arguments that a study states as text, as far as they are plain."""
-    out = {}
-    for name, text in texts.items():
-        try:
-            out[name] = ast.literal_eval(text)
-        except (ValueError, SyntaxError):
-            continue
-    return out
-
-
-def read_parameter(text: str) -> Parameter | Choice:
-    """The parameter that `describe` has stated. Raises ValueError for another text."""
-    name, _, rest = text.partition(": ")
-    numbers = re.fullmatch(r"(\S+) to (\S+?)( log| whole)?", rest)
-    if numbers:
-        low, high, kind = numbers.groups()
-        return Parameter(name, float(low), float(high), log=kind == " log", whole=kind == " whole")
-    # "or" between texts, not within one
-    options = ast.parse(rest, mode="eval").body
-    if not isinstance(options, ast.BoolOp):
-        raise ValueError(f"{text!r} is no parameter")
-    return Choice(name, [ast.literal_eval(option) for option in options.values])

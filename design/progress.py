@@ -6,6 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING
 
 import torchfilm as tf
+from design.study import Study
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -36,6 +37,17 @@ def finish(bar: tqdm | None) -> None:
     if bar is not None:
         bar.total = bar.n
         bar.refresh()
+
+
+def show(bar: tqdm | None, study: Study) -> None:
+    """Show the colonies and the lowest loss of a search so far."""
+    if bar is None:
+        return
+    found = study.best()
+    advance(bar, min(study.colonies, bar.total) - bar.n)
+    failed = study.failed
+    best = "no full-size colony yet" if found is None else f"best loss {found[1]:.4f}"
+    bar.set_postfix_str(best + (f", {failed} colonies failed" if failed else ""))
 
 
 def advance(bar: tqdm | None, colonies: float) -> None:

@@ -22,11 +22,12 @@ from torchfilm import checks
 @dataclass(eq=False)
 class Proposal:
     """batch: what a method proposes; entry: the first of its designs, which have been grown. known:
-    the batch is of designs that were known before, and no method's. choosing: seconds that the
-    method took for it."""
+    the batch is of these designs, and no method's; number: of the batch, from 0. choosing: seconds
+    that the method took for it."""
 
     batch: Batch
-    known: bool = False
+    known: KnownDesigns | None = None
+    number: int = 0
     choosing: float = 0.0
     entry: Entry | None = None
 
@@ -36,8 +37,8 @@ class Proposal:
     ) -> Proposal:
         """The batch of a number, from 0: the known designs first of all, then what a method
         proposes."""
-        if known is not None and number == 0:
-            return cls(Batch(known.points), known=True)  # their losses alone are told
+        if known is not None and number < len(known.batches):
+            return cls(Batch(known.batches[number]), known, number)  # their losses alone are told
         begun = time.perf_counter()
         batch = method.ask()
         seconds = time.perf_counter() - begun
@@ -82,16 +83,27 @@ class Proposal:
         not take any."""
         assert self.entry is not None
         # copies: a method may write into the arrays that it gets, and the study must not change
-        found = copy.deepcopy(self.entry.loss if self.entry.goals is None else self.entry.goals)
-        if self.known:
-            know = getattr(method, "know", None)
-            if know is not None:
-                know(self.entry.points.copy(), found)
+        found = copy.deepcopy(self.entry.target_losses)
+        if self.known is not None:
+            self._tell_known(method, self.known)
             return
         batch = replace(self.batch, points=self.entry.points)
         slopes = (copy.deepcopy(self.entry.slopes),) if batch.slopes else ()
         more = {"residuals": copy.deepcopy(self.entry.residuals)} if batch.residuals else {}
         method.tell(batch, found, *slopes, **more)
+
+    def _tell_known(self, method: Method, known: KnownDesigns) -> None:
+        """Let a method learn all known designs at once, with the last batch of them."""
+        assert self.entry is not None
+        know = getattr(method, "know", None)
+        if know is None or self.number < len(known.batches) - 1:
+            return
+        before = [known.entry] if known.entry is not None and self.number else []
+        every = [*before, self.entry]
+        know(
+            np.concatenate([e.points for e in every]),
+            np.concatenate([e.target_losses for e in every]),
+        )
 
 
 def repeat_study(

@@ -44,6 +44,18 @@ def remark_on_batch(task: Task, study: Study, size: float, loss: np.ndarray) -> 
         )
 
 
+def remark_on_stop(task: Task, study: Study, colonies: int, why: str = "") -> None:
+    """Say where a run has stopped before its end, and how to go on. colonies: the budget."""
+    found = "front" if task.goals else "best"
+    kept = (
+        f"{study.path} keeps them; run the search again to resume it"
+        if study.path
+        else f"search.{found}() returns the best of them"
+    )
+    at = f"{study.colonies:.0f} of {colonies} colonies"
+    print(f"stopped at {at}{why}; {kept}.", file=sys.stderr)
+
+
 def remark_on_end(task: Task, study: Study, method: Method, colonies: int, holds: bool) -> None:
     """Say what makes the outcome worth little. colonies: the budget. holds: whether the search
     found what was wanted."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import sys
+import time
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,9 +21,15 @@ from design.growing import FinishedColonies
 from design.known import KnownDesigns, Start, known_designs
 from design.methods import Chosen, Exhaustive, Method, choose, designs_of, method_of
 from design.objective import Objective
-from design.progress import advance, finish, open_bar
+from design.progress import finish, open_bar, show
 from design.proposal import Proposal, checked_method, repeat_study
-from design.remarks import all_failed, remark_on_batch, remark_on_begin, remark_on_end
+from design.remarks import (
+    all_failed,
+    remark_on_batch,
+    remark_on_begin,
+    remark_on_end,
+    remark_on_stop,
+)  # fmt: skip
 from design.study import Study
 from design.task import Task, TaskOptions
 from design.trivial import check_within_reach
@@ -37,12 +44,15 @@ IN_VAIN, LEAST_IN_VAIN = 0.25, 64
 
 @dataclass(eq=False)
 class SearchProgress:
-    """What a search has found so far. chosen: its method; grown: the colonies of designs that were
+    """What a search has found so far. chosen: its method; known: the designs with which its study
+    began; deadline: when it ends, in seconds of the clock; grown: the colonies of designs that were
     drawn or measured, and scored: the losses of those that only a report needs, by their points."""
 
     study: Study
     why_regrown: str
     chosen: Chosen | None = None
+    known: KnownDesigns | None = None
+    deadline: float = math.inf
     grown: dict[bytes, list[FinishedColonies]] = field(default_factory=dict)
     scored: dict[bytes, np.ndarray] = field(default_factory=dict)
 
@@ -63,9 +73,10 @@ class Search(TaskOptions):
     for several goals "nsga2", one of their objects with settings of its own, or any object with
     start, ask and tell (`Method`); "auto" chooses, and `best.table()` says why. finals: how the
     best designs are tested on fresh seeds; None leaves this out. start: designs from which the
-    search starts: their values by name, a `Best`, the file of a saved design, or a `Study` or its
-    file. A study of the same task with other bounds, or without some of the parameters, keeps its
-    losses; of any other designs the best are grown again; `run` prints which are left out, and why.
+    search starts: their values by name, a `Best`, the file of a saved design, a `Study` or its
+    file, or a list of these. A study of the same task with other bounds, or without some of the
+    parameters, keeps its losses; of any other study the best designs are grown again; `run` prints
+    which are left out, and why.
     method_seed: of what the method draws, by default `seed`, which the colonies have; to compare
     methods on the same colonies. `TaskOptions` documents the other arguments;
     `search.objective.task` holds them checked. Raises the errors of `Task`, and InputError for a
@@ -94,8 +105,10 @@ class Search(TaskOptions):
             ("method", chosen), ("objective", Objective(task)), ("_known", known)
         ):  # fmt: skip
             object.__setattr__(self, name, value)
-        started = SearchProgress(self._open_study(None, "auto"), task.tried.why_regrown)
-        object.__setattr__(self, "_progress", started)
+        study = Study(self._about("auto", known), task.space.names, task.streams(None))
+        if known is not None and known.entry is not None:
+            study.entries.append(known.entry)
+        object.__setattr__(self, "_progress", SearchProgress(study, task.tried.why_regrown))
 
     def __repr__(self) -> str:
         study = self.study
@@ -129,6 +142,7 @@ class Search(TaskOptions):
         *,
         study: str | Path | None = None,
         stop_at: float | None = None,
+        wall_hours: float | None = None,
         executor: Executor | None = None,
         work_items: int = 1,
         progress: bool | None = None,
@@ -141,24 +155,19 @@ class Search(TaskOptions):
         seeds, of which the best is returned. stop_at: a loss that is good enough. As soon as a
         design reaches it, and holds it on fresh seeds, the search ends. study: the file that keeps
         every evaluation. If it exists and belongs to this search, the search resumes from it, and
-        its colonies count. executor: of the `concurrent.futures` kind (processes, Dask, …).
+        its colonies count. wall_hours: of the clock, after which no batch and no finals begin; a
+        study may resume. executor: of the `concurrent.futures` kind (processes, Dask, …).
         work_items: the least number of parts into which a batch is cut for it. progress: a bar
         with the lowest loss so far: True, always; False, never; None, in a notebook and on a
-        terminal. Raises InputError for an argument that is not allowed, for the
-        study of another search, and where no design was grown to full size.
+        terminal. Raises InputError for an argument that is not allowed, for the study of another
+        search, and where no design was grown to full size.
         """
         self._check_run(colonies, stop_at)
         checks.integer("work_items", work_items, least=1)
-        study = None if study is None else checks.file_path("study", study)
-        if self._known is not None and self._known.remark:
-            print(self._known.remark, file=sys.stderr)
-        remark_on_begin(self.objective.task)
-        chosen = self._choose(colonies, study)
-        self._progress.chosen = chosen
-        self._progress.study = self._open_study(study, chosen.describe())
+        self._begin(colonies, study, wall_hours)
         try:
             with open_bar(colonies, progress) as bar:
-                _show(bar, self.study)
+                show(bar, self.study)
                 finals = None
                 if self.finals is not None:
                     task = self.objective.task
@@ -166,14 +175,21 @@ class Search(TaskOptions):
                     run = (task, self.study, under_each, executor, work_items)
                     finals = FinalsRun(self.finals, *run)
                 holds = self._search(colonies, stop_at, finals, bar, executor, work_items)
-                if finals is not None and not holds and not all_failed(self.study):
+                late = not holds and self._is_late
+                if finals is not None and not holds and not late and not all_failed(self.study):
                     self._with_all_left(finals, colonies).run()
-                _show(bar, self.study)
+                show(bar, self.study)
                 finish(bar)
         except KeyboardInterrupt:
-            self._report_interrupt(colonies)
+            remark_on_stop(self.objective.task, self.study, colonies)
             raise
-        remark_on_end(self.objective.task, self.study, chosen.method, colonies, holds)
+        if late:
+            remark_on_stop(
+                self.objective.task, self.study, colonies, f" after wall_hours={wall_hours:g}"
+            )
+        assert self._progress.chosen is not None
+        method = self._progress.chosen.method
+        remark_on_end(self.objective.task, self.study, method, colonies, holds)
         return self.front() if self.objective.task.goals else self.best()
 
     def _with_all_left(self, finals: FinalsRun, colonies: int) -> FinalsRun:
@@ -218,15 +234,17 @@ class Search(TaskOptions):
         task, method = self.objective.task, self._progress.chosen.method
         seed = task.seed if self.method_seed is None else self.method_seed
         method.start(task.space, seed, task.replicates)
-        proposal = repeat_study(method, task, self.study, self._known)
+        known = self._progress.known
+        proposal = repeat_study(method, task, self.study, known)
         within_reach = check_within_reach(self.objective, self.study)
         while not self._reached(stop_at, finals):
+            if self._is_late:
+                return False
             in_vain = self.study.searched >= max(IN_VAIN * colonies, LEAST_IN_VAIN)
             if proposal is None and (self._is_over or (in_vain and all_failed(self.study))):
                 return False
-            proposal = proposal or Proposal.of_number(
-                len(self.study.entries), method, task, self._known
-            )
+            number = len(self.study.entries)
+            proposal = proposal or Proposal.of_number(number, method, task, known)
             part = proposal.part(self.objective, self._room(colonies, False))
             if part is None and finals is not None and self._may_be_certain and finals.sound():
                 part = proposal.part(self.objective, self._room(colonies, True))
@@ -244,7 +262,7 @@ class Search(TaskOptions):
             if proposal.complete:
                 proposal.tell(method)
                 proposal = None
-            _show(bar, self.study)
+            show(bar, self.study)
         return True
 
     def _reserved(self, colonies: int, certain: bool = False) -> float:
@@ -332,13 +350,12 @@ class Search(TaskOptions):
             fresh = fresh_losses(task, self.study, self.finals.sizes, point)
         return Best(self, values, point, losses, fresh)
 
-    def _choose(self, colonies: int, path: str | Path | None) -> Chosen:
-        """The method of a run."""
+    def _choose(self, colonies: int, resumed: Study | None) -> Chosen:
+        """The method of a run. resumed: the study that goes on."""
         task = self.objective.task
         if self.method != "auto":
             return Chosen(method_of(self.method))
-        resumed = path is not None and Path(path).is_file()
-        before = Study.read(path).about.get("method", "") if path is not None and resumed else ""
+        before = "" if resumed is None else resumed.about.get("method", "")
         chosen = choose(
             task.space.size,
             colonies / task.colonies_each,
@@ -357,43 +374,44 @@ class Search(TaskOptions):
         why = "" if told else self.objective.why_no_squares
         return replace(chosen, why=f"{chosen.why}; no exact derivatives: {why}") if why else chosen
 
-    def _open_study(self, path: str | Path | None, method: str) -> Study:
+    def _about(self, method: str, known: KnownDesigns | None) -> dict[str, Any]:
+        """What the losses of a study depend on."""
         task = self.objective.task
-        names = task.space.names
-        about = task.describe() | {"names": list(names), "method": method}
+        about = task.describe() | {"names": list(task.space.names), "method": method}
         if self.method_seed is not None:
             about["method seed"] = self.method_seed
-        if self._known is not None:
-            about["start"] = self._known.describe()
-        streams = task.streams(None)
-        if path is None:
-            study = Study(about, names, streams)
-        else:
-            study = Study.open(path, about, names, streams)
-        if self._known is not None and self._known.entry and not study.entries:
-            study.entries.append(self._known.entry)
-        return study
+        if known is not None:
+            about["start"] = known.describe()
+        return about
 
-    def _report_interrupt(self, colonies: int) -> None:
-        study = self.study
-        found = "front" if self.objective.task.goals else "best"
-        kept = (
-            f"{study.path} keeps them; run the search again to resume it"
-            if study.path
-            else f"search.{found}() returns the best of them"
-        )
-        print(f"stopped at {study.colonies:.0f} of {colonies} colonies; {kept}.", file=sys.stderr)
+    def _begin(self, colonies: int, path: str | Path | None, wall_hours: float | None) -> None:
+        """Choose the method of a run, and open its study, which may resume."""
+        task, progress = self.objective.task, self._progress
+        progress.deadline = math.inf
+        if wall_hours is not None:
+            hours = checks.number("wall_hours", wall_hours, above=0.0)
+            progress.deadline = time.monotonic() + 3600.0 * hours
+        path = None if path is None else checks.file_path("study", path)
+        resumed = Study.read(path) if path is not None and path.exists() else None
+        progress.chosen = self._choose(colonies, resumed)
+        known = self._known
+        if known is not None and resumed is not None:
+            known = known.begun(resumed)
+        about = self._about(progress.chosen.describe(), known)
+        if resumed is not None:
+            resumed.check(about)
+        progress.known = known
+        progress.study = resumed or Study.new(path, about, task.space.names, task.streams(None))
+        if known is not None and known.entry is not None and not progress.study.entries:
+            progress.study.entries.append(known.entry)
+        if known is not None and known.remark:
+            print(known.remark, file=sys.stderr)
+        remark_on_begin(task)
 
-
-def _show(bar: tqdm | None, study: Study) -> None:
-    """Show the colonies and the lowest loss so far."""
-    if bar is None:
-        return
-    found = study.best()
-    advance(bar, min(study.colonies, bar.total) - bar.n)
-    failed = study.failed
-    best = "no full-size colony yet" if found is None else f"best loss {found[1]:.4f}"
-    bar.set_postfix_str(best + (f", {failed} colonies failed" if failed else ""))
+    @property
+    def _is_late(self) -> bool:
+        """Whether the hours of the run have passed."""
+        return time.monotonic() >= self._progress.deadline
 
 
 def _none_yet() -> tf.InputError:

@@ -3,7 +3,7 @@ it had never stopped."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -209,23 +209,23 @@ class Study:
             self._stamp = write_study(self.path, data, self._stamp)
 
     @classmethod
-    def open(
-        cls, path: str | Path, about: dict[str, Any], names: Sequence[str], streams: Sequence[int]
+    def new(
+        cls, path: Path | None, about: dict[str, Any], names: Sequence[str], streams: Sequence[int]
     ) -> Study:
-        """The study at a path, or a new one where there is no file. Raises InputError for the study
-        of another search."""
-        path = checks.file_path("study", path)
-        if not path.exists():
-            if not path.parent.is_dir():
-                raise checks.input_error(
-                    "study", str(path), "in a folder that exists", f"Make {path.parent} first."
-                )
-            return cls(about, tuple(names), tuple(streams), path)
-        study = cls.read(path)
-        differ = [n for n in {**about, **study.about} if about.get(n) != study.about.get(n)]
+        """A study without evaluations, which will be kept at a path, if one is given. Raises
+        InputError where there is no such folder."""
+        if path is not None and not path.parent.is_dir():
+            raise checks.input_error(
+                "study", str(path), "in a folder that exists", f"Make {path.parent} first."
+            )
+        return cls(about, tuple(names), tuple(streams), path)
+
+    def check(self, about: Mapping[str, Any]) -> None:
+        """Raises InputError where this is the study of another search than `about` tells of."""
+        differ = [n for n in {**about, **self.about} if about.get(n) != self.about.get(n)]
         if differ:
-            raise tf.InputError(refusal(path, differ, study.about, about))
-        return study
+            assert self.path is not None
+            raise tf.InputError(refusal(self.path, differ, self.about, about))
 
     @classmethod
     def read(cls, path: str | Path) -> Study:

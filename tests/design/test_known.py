@@ -9,7 +9,7 @@ from searching import Level, built, lit, paced
 
 import torchfilm as tf
 from design import CMAES, Bayesian, Choice, Local, Parameter, Racing, Search, Sobol, Study
-from design.known import read_parameter
+from design.known_studies import read_parameter
 
 NARROW = [Parameter("make", 0.5, 2.0, log=True)]
 WIDE = [Parameter("make", 0.1, 10.0, log=True)]

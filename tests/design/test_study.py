@@ -212,7 +212,7 @@ def test_of_two_searches_at_one_path_one_goes_on(tmp_path):
     """Both began where there was no file: the second to write is told, the first study stays."""
     path = tmp_path / "s.h5"
     mine, other = search(seed=0), search(seed=1)
-    study = Study.open(path, {"names": ["make"]}, ("make",), tuple(range(8)))
+    study = Study.new(path, {"names": ["make"]}, ("make",), tuple(range(8)))
     other.run(12, study=path, progress=False)
     entry = Study.read(path).entries[0]
     with pytest.raises(tf.SimulationError, match=r"s\.h5 has been written by another process"):

@@ -1,0 +1,158 @@
+"""A search starts from several studies, and goes on after they have grown; it stops after hours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from searching import Level, lit
+
+import torchfilm as tf
+from design import CMAES, Bayesian, Finals, Parameter, Search, Sobol, Spread, Study
+
+MAKE = [Parameter("make", 0.1, 10.0, log=True)]
+
+
+def search(parameters=MAKE, **options):
+    options = {
+        "method": Sobol(batch=3), "cells": 3, "replicates": 2, "finals": None, **options
+    }  # fmt: skip
+    return Search(lit, parameters, Level(wanted=1.0), **options)
+
+
+def ran(colonies, study=None, **options):
+    made = search(**options)
+    made.run(colonies, study=study, progress=False)
+    return made
+
+
+def points_of(study):
+    return np.concatenate([e.points for e in study.entries])
+
+
+def test_studies_with_the_same_seed_are_joined():
+    """Of the second study the designs of the first are left out."""
+    one = ran(12)
+    other = ran(12, method=Sobol(batch=2), method_seed=5)
+    made = search(start=[one.study, other.study, one.study])
+    known = made.study.entries[0]
+    assert known.copies == 0 and len(known.points) == 12
+    both = np.concatenate([points_of(one.study), points_of(other.study)])
+    assert known.points == pytest.approx(both, abs=1e-12)  # of the logarithm of a value
+    assert made.best().loss == min(one.best().loss, other.best().loss)
+    joined = np.concatenate([e.loss for s in (one, other) for e in s.study.entries])
+    assert np.array_equal(known.loss, joined) and made._known.remark == ""
+
+
+def test_of_studies_on_other_seeds_the_best_are_grown_and_told_with_the_rest(capsys, tmp_path):
+    told = []
+
+    class Listening(Sobol):
+        def know(self, points, loss):
+            told.append((points, loss))
+
+    ran(12, tmp_path / "one.h5")
+    ran(8, tmp_path / "other.h5", seed=3)
+    start = [{"make": 3.3}, tmp_path / "other.h5", tmp_path / "one.h5"]
+    made = ran(16, tmp_path / "new.h5", start=start, method=Listening(batch=3))
+    held, grown, drawn = made.study.entries
+    assert (held.copies, len(held.points)) == (0, 6)
+    assert (grown.copies, len(grown.points)) == (1, 1 + 4)
+    assert grown.values[0]["make"] == pytest.approx(3.3)
+    assert len(drawn.points) == 3 and made.study.colonies == 16
+    ((points, loss),) = told
+    assert np.array_equal(points, np.concatenate([held.points, grown.points]))
+    assert np.array_equal(loss, np.concatenate([held.loss, grown.loss]))
+    said = capsys.readouterr().err
+    assert "start: other.h5: its losses do not hold here (another seed)" in said
+    assert "one.h5: " not in said
+
+
+@pytest.mark.parametrize(
+    "method", [CMAES(population=4), Bayesian(batch=2), Sobol(batch=3)], ids=str
+)
+@pytest.mark.parametrize("seed", [0, 3], ids=["with losses", "grown again"])
+def test_a_study_goes_on_after_its_start_has_grown(method, seed, tmp_path, capsys):
+    """As if the file from which it began had stayed as it was."""
+    ran(8, tmp_path / "old.h5", seed=seed)
+    whole = ran(32, start=tmp_path / "old.h5", method=method)
+    ran(20, tmp_path / "new.h5", start=tmp_path / "old.h5", method=method)
+    ran(16, tmp_path / "old.h5", seed=seed)
+    capsys.readouterr()
+    made = ran(32, tmp_path / "new.h5", start=tmp_path / "old.h5", method=method)
+    assert np.array_equal(points_of(made.study), points_of(whole.study))
+    assert made.best().loss == whole.best().loss
+    said = capsys.readouterr().err
+    assert "start: the study began with 4 of these designs, and goes on with them" in said
+    # one whose best designs are others now goes on, too
+    again = ran(34, tmp_path / "new.h5", start=Study.read(tmp_path / "old.h5"), method=method)
+    assert again.study.colonies == 34
+
+
+def test_a_study_does_not_go_on_with_other_values(tmp_path):
+    """Values that are given by hand are meant, so that none is left out in silence."""
+    ran(8, tmp_path / "old.h5")
+    both = [tmp_path / "old.h5", {"make": 2.0}]
+    ran(12, tmp_path / "new.h5", start=both)
+    ran(16, tmp_path / "old.h5")
+    ran(14, tmp_path / "new.h5", start=both)
+    others = ran(8, method_seed=5).study
+    for start in ([*both, {"make": 3.0}], {"make": 2.0}, [others, {"make": 2.0}]):
+        with pytest.raises(tf.InputError, match="Different: start"):
+            ran(16, tmp_path / "new.h5", start=start)
+
+
+def test_a_study_with_nothing_in_the_bounds_is_left_out_beside_others(capsys):
+    low = ran(8, parameters=[Parameter("make", 0.1, 0.2, log=True)])
+    high = ran(8, parameters=[Parameter("make", 1.0, 2.0, log=True)])
+    upper = [Parameter("make", 1.0, 10.0, log=True)]
+    made = ran(12, parameters=upper, start=[low.study, high.study])
+    assert len(made.study.entries[0].points) == 4
+    assert "start: a study: 4 of its 4 designs lie beyond the bounds." in capsys.readouterr().err
+    with pytest.raises(tf.InputError, match=r"a study of 8 designs.*within the bounds"):
+        search(upper, start=[low.study, low.study])
+
+
+def test_goals_of_several_studies_are_told():
+    goals = {"targets": [Level(wanted=1.0), Spread(Level(wanted=1.0))], "method": "nsga2"}
+    make = lambda **options: Search(lit, MAKE, cells=3, replicates=2, finals=None, **options)
+    one, other = make(**goals), make(**goals, seed=3)
+    one.run(16, progress=False)
+    other.run(16, progress=False)
+    made = make(**goals, start=[one.study, other.study])
+    made.run(40, progress=False)
+    held, grown = made.study.entries[:2]
+    assert held.goals.shape == grown.goals.shape == (8, 2) and held.copies == 0
+
+
+def test_hours_end_a_run_which_a_study_resumes(tmp_path, capsys, monkeypatch):
+    """The clock passes the deadline as the third batch is wanted; the finals wait for more time."""
+    whole = ran(40, finals=Finals(share=0.4, most=2))
+    path = tmp_path / "s.h5"
+    made = search(finals=Finals(share=0.4, most=2))
+    clock = iter([0.0, 1800.0, 3599.0, 3600.0, 3600.0])
+    monkeypatch.setattr("design.search.time.monotonic", lambda: next(clock))
+    best = made.run(40, study=path, wall_hours=1.0, progress=False)
+    assert len(made.study.entries) == 2 and not made.study.finals
+    assert best.loss == min(e.loss.min() for e in made.study.entries)
+    said = "stopped at 12 of 40 colonies after wall_hours=1; "
+    assert said + f"{path} keeps them; run the search again to resume it." in (
+        capsys.readouterr().err
+    )
+    monkeypatch.undo()
+    again = ran(40, path, finals=Finals(share=0.4, most=2))
+    assert np.array_equal(points_of(again.study), points_of(whole.study))
+    assert again.study.finals and again.best().loss == whole.best().loss
+
+
+def test_hours_that_pass_before_the_first_batch(capsys):
+    made = search()
+    with pytest.raises(tf.InputError, match="no design has been grown to full size yet"):
+        made.run(24, wall_hours=1e-9, progress=False)
+    assert "stopped at 0 of 24 colonies after wall_hours=1e-09" in capsys.readouterr().err
+    assert made.run(24, progress=False).loss == ran(24).best().loss  # it has no limit of its own
+
+
+@pytest.mark.parametrize("hours", [0, -1.0, float("nan"), "2"])
+def test_hours_are_positive(hours):
+    with pytest.raises(tf.InputError, match="wall_hours"):
+        search().run(8, wall_hours=hours, progress=False)
