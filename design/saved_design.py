@@ -165,9 +165,14 @@ def _check_content(found: Mapping[str, Any]) -> None:
     search = found.get("search", {"names": []})
     if not isinstance(search, dict) or not isinstance(search["names"], list):
         raise TypeError("its search is no table with names")
+    if not isinstance(search.get("conditions", []), list):
+        raise TypeError("the conditions of its search are no list")
     for name in search["names"]:
         if name not in found["parameters"]:
             raise KeyError(f"{name!r}, of the search, is not among its parameters")
+    for name in ("replicates", "reduce", "replay", "point", "losses"):
+        if "search" in found and name not in search:
+            raise KeyError(f"its search has no {name}")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -266,7 +271,9 @@ class SavedDesign:
         edited since."""
         found, space = np.array(self._search["point"]), self.objective.task.space
         same = [
-            math.isclose(new, old, rel_tol=1e-12) if isinstance(old, float) else new == old
+            math.isclose(new, old, rel_tol=1e-12)
+            if isinstance(old, float) and isinstance(new, (int, float))
+            else new == old
             for new, old in ((self.values[n], x) for n, x in space.values(found).items())
         ]
         return found if all(same) else space.point(self.values)

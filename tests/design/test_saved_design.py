@@ -196,6 +196,14 @@ FOREIGN = {
         '{"scene": "a", "parameters": {}, "search": {"names": ["nope"]}}',
         "'nope'.*not among",
     ),
+    "a number of conditions": (
+        '{"scene": "a", "parameters": {}, "search": {"names": [], "conditions": 3}}',
+        "conditions of its search are no list",
+    ),
+    "a search without its end": (
+        '{"scene": "a", "parameters": {}, "search": {"names": []}}',
+        "its search has no replicates",
+    ),
 }
 
 
@@ -213,6 +221,17 @@ def test_what_a_file_does_not_hold_is_named(tmp_path):
     for name in ("loss", "losses", "dtype"):
         with pytest.raises(tf.InputError, match=f"does not hold the {name} that"):
             getattr(design, name)
+
+
+def test_an_edited_value_of_another_kind_is_named(saved, tmp_path):
+    content = json.loads(saved[1].read_text())
+    name = next(iter(content["parameters"]))
+    content["parameters"][name] = [1.0]
+    (tmp_path / "file.json").write_text(json.dumps(content))
+    design = load_design(tmp_path / "file.json", scene=lit)
+    asked = pytest.raises(tf.InputError, match=rf"{name} = \[1\.0\].*a number")
+    with pytest.warns(UserWarning, match="of another scene"), asked:
+        _ = design.point
 
 
 def test_what_is_missing_is_named(saved, tmp_path):
