@@ -372,3 +372,35 @@ def test_rows_are_selected_by_the_value_that_was_typed(tmp_path):
         pass
     with h5py.File(tmp_path / "a.h5") as file:
         assert "parameters_until" not in file
+
+
+@pytest.mark.parametrize("most", [1, 600, 1 << 18])
+def test_a_table_of_all_frames_is_that_of_each(tmp_path, monkeypatch, most):
+    """However many frames are read at once, also where parameters change on the way."""
+    monkeypatch.setattr("torchfilm.io.blocks.MOST_ROWS", most)
+    medium = tf.Medium(
+        ahl=tf.Signal(diffusion=10.0, initial=1.0), box=((-16.0, -16.0), (16.0, 16.0)),
+        spacing=4.0, outside="reservoir",
+    )  # fmt: skip
+    others = tf.Division(length=4.0), tf.Mechanics(dim=2), medium
+    of = lambda rate: tf.Scene(tf.Growth(rate=rate), *others, dt=DT)
+    path, first, later = tmp_path / "run.h5", of([0.8, 1.0]), of([0.8, 1.5])
+    for _ in tf.simulate(first, until=0.5, record=tf.Recorder(path, first, every=2)):
+        pass
+    with tf.Results(path) as results:
+        state = results.state(later, changed=True)
+    again = tf.Recorder(path, later, append=True, changed=True)
+    for _ in tf.simulate(later, state, until=1.0, record=again):
+        pass
+    with tf.Results(path) as results:
+        whole = results.table(internals=True)
+        assert "ahl_reservoir" in results.colony_fields(1)
+        each = [results.table(k, internals=True) for k in range(len(results))]
+    assert len(each) > 6
+    for name, column in whole.items():
+        joined = np.concatenate([one[name] for one in each])
+        assert column.dtype == joined.dtype and np.array_equal(
+            column, joined, equal_nan=column.dtype.kind == "f"
+        )
+    rates = {c: set(whole["rate"][whole["colony"] == c]) for c in (0, 1)}
+    assert rates == {0: {0.8}, 1: {1.0, 1.5}}

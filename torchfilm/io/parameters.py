@@ -67,6 +67,12 @@ def parameters_at(file: h5py.File, step: int) -> dict[str, np.ndarray]:
         return {name: found.get(name, np.full(size, np.nan)) for name in sorted(names)}
 
 
+def last_steps(file: h5py.File) -> list[int]:
+    """The last steps at which earlier values of parameters held, in order."""
+    with blaming_file(file, NOW):
+        return sorted(map(int, file[UNTIL])) if UNTIL in file else []
+
+
 def _as_typed(value: np.ndarray) -> np.ndarray:
     """A column in float64. Of float32 it is the shortest decimal that is read as the same number,
     0.1 and not 0.10000000149, so that rows can be selected by what was typed."""

@@ -52,6 +52,12 @@ def read_dataset(file: h5py.File, name: str, at: int | slice | EllipsisType = ..
     return found
 
 
+def dataset_names(file: h5py.File, group: str) -> tuple[str, ...]:
+    """The datasets of a group; empty if there is no such group."""
+    with blaming_file(file, group):
+        return tuple(file[group]) if group in file else ()
+
+
 def read_attribute(file: h5py.File, name: str, missing: str | None = None) -> Any:
     """What an attribute holds as JSON, or `missing` does. Raises InputError if it cannot be
     read."""

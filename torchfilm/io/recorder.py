@@ -84,6 +84,7 @@ class Recorder(metaclass=checks.KnownKeywords):
         self.model: Model | None = None
         self.first_step = 0
         self.tables: dict[str, h5py.Dataset] = {}
+        self.sizes: dict[str, int] = {}  # as `committed` tells them
         # events since the last frame that is written
         self.births: list[events.Rows] = []
         self.ends: list[events.Rows] = []
@@ -111,12 +112,10 @@ class Recorder(metaclass=checks.KnownKeywords):
             return
         if not self.overwrite:
             raise checks.input_error(
-                "record",
-                shown,
-                "a path where there is no file yet",
+                "record", shown, "a path where there is no file yet",
                 "Choose another path, replace the file with record=tf.Recorder(path, scene,"
                 " overwrite=True), or continue its run with append=True instead.",
-            )
+            )  # fmt: skip
         replacing.check_replaceable(self.path)
 
     def attach(self, model: Model, dt: float) -> None:
@@ -168,7 +167,7 @@ class Recorder(metaclass=checks.KnownKeywords):
     def _open(self, state: State) -> None:
         """Make the new file, complete with a frame, under another name; then put it in place."""
         self._check_still_free()
-        self.births, self.ends = [], []
+        self.sizes, self.births, self.ends = {}, [], []
         try:
             with ExitStack() as hold:
                 if self.append:
@@ -377,13 +376,16 @@ class Recorder(metaclass=checks.KnownKeywords):
                 f" frame may need {needed}. {self._safe}"
             )
 
+    def _table(self, name: str) -> Any:
+        """A dataset of the file; None where it has none of this name."""
+        if name not in self.tables and self.file is not None:
+            self.tables[name] = self.file.get(name)
+        return self.tables[name]
+
     def _append(self, name: str, value: np.ndarray, at: int) -> None:
         """Write rows at `at` and flush them. A dataset closed with rows in its cache would hide a
         failure to write them."""
-        assert self.file is not None
-        if name not in self.tables:
-            self.tables[name] = self.file[name]
-        table = self.tables[name]
+        table = self._table(name)
         try:
             write_rows(table, at, value)
             table.flush()
@@ -393,16 +395,15 @@ class Recorder(metaclass=checks.KnownKeywords):
 
     def _write_frame(self, file: h5py.File, state: State) -> None:
         columns = cell_columns(state)
-        known = set(file["cells"])
-        unknown = [n for n in columns if n not in known]
+        unknown = [n for n in columns if self._table(f"cells/{n}") is None]
         if unknown:
             raise SimulationError(
                 f"the field {unknown[0]!r} appeared during the run, after {self.path} was laid out:"
                 " give it a first value in Rules(…, variables=…) and start the run again."
             )
-        sizes = committed(file)
-        frame, first_voxel = sizes["frames"], 0
-        first_row = next_chunk(file["cells/uid"], sizes["rows"])
+        sizes = dict(self.sizes or committed(file))
+        frame, first_voxel, voxels = sizes["frames"], 0, 0
+        first_row = next_chunk(self._table("cells/uid"), sizes["rows"])
         for name, value in columns.items():
             self._append(f"cells/{name}", value, first_row)
         for name, value in found_columns(state).items():
@@ -411,13 +412,14 @@ class Recorder(metaclass=checks.KnownKeywords):
             names, none = LINEAGE[table], np.empty(0, np.int64)
             merged = [np.concatenate(c) for c in zip(*found, strict=True)] or [none] * len(names)
             for name, value in zip(names, merged, strict=True):
-                if f"lineage/{table}/{name}" in file:  # older files have no lengths, or times
+                if self._table(f"lineage/{table}/{name}") is not None:  # older files lack some
                     self._append(f"lineage/{table}/{name}", value, sizes[table])
             sizes[table] += len(merged[0])
         for name, value in colony_columns(state).items():
             self._append(f"frames/colony/{name}", value[None], frame)
         for name, value in voxel_columns(state).items():
-            first_voxel = next_chunk(file[f"signals/{name}"], sizes["voxels"])
+            first_voxel = next_chunk(self._table(f"signals/{name}"), sizes["voxels"])
+            voxels = first_voxel + len(value)
             self._append(f"signals/{name}", value, first_voxel)
         for name, value in grid_columns(state, first_voxel).items():
             self._append(f"frames/grid/{name}", value[None], frame)
@@ -434,4 +436,5 @@ class Recorder(metaclass=checks.KnownKeywords):
         for name in FRAME_COLUMNS:
             self._append(f"frames/{name}", np.asarray(row[name])[None], frame)
         file.flush()
-        self.births, self.ends = [], []
+        ends = {"frames": frame + 1, "rows": first_row + state.cells, "voxels": voxels}
+        self.sizes, self.births, self.ends = sizes | ends, [], []

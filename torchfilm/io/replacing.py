@@ -24,6 +24,8 @@ except ImportError:  # not on Windows
 
 # POSIX renames an open file, and replaces one that others have open. Windows does neither.
 RENAMES_OPEN_FILES = os.name != "nt"
+# no cache of chunks: each is written once, and to flush a cache takes longer with every frame
+WRITING: dict[str, Any] = {"libver": "latest", "rdcc_nbytes": 0}
 JUST_MADE = 0.2  # s, by when a file that a process has created is locked
 CHUNKS_AT_ONCE = 16  # that are copied: whole ones, so that each is compressed once
 
@@ -94,7 +96,7 @@ def create_file(path: Path) -> h5py.File:
         check_replaceable(path)
         path.unlink(missing_ok=True)
     try:
-        return h5py.File(path, "x", libver="latest")
+        return h5py.File(path, "x", **WRITING)
     except FileExistsError as error:
         raise _written_by_another(path) from error
     except OSError as error:
@@ -149,7 +151,7 @@ def put_in_place(file: h5py.File, source: Path, path: Path) -> h5py.File:
             "This operating system cannot replace an open file. Close it in the other process, or"
             " here: results.close(), or `with tf.Results(…) as results:`.",
         ) from error
-    file = h5py.File(path, "r+", libver="latest")
+    file = h5py.File(path, "r+", **WRITING)
     file.swmr_mode = True
     return file
 

@@ -14,13 +14,14 @@ import numpy as np
 import torch
 
 from torchfilm.initial_cells import Cells
+from torchfilm.io.blocks import spans
 from torchfilm.io.card import card
 from torchfilm.io.identity import check_same_scene, declared_fields
 from torchfilm.io.layout import AT_CELLS, INTERNAL_BEFORE, INTERNAL_ENDING_BEFORE
 from torchfilm.io.lineage import Lineage
 from torchfilm.io.parameters import parameters_at
 from torchfilm.io.reading import (
-    blaming_file,
+    dataset_names,
     frame_count,
     inode_of_open,
     open_results,
@@ -80,9 +81,7 @@ class Results(metaclass=checks.KnownKeywords):
         return read_dataset(self.file, name, at)
 
     def _names(self, group: str) -> tuple[str, ...]:
-        """The datasets of a group; empty if there is no such group."""
-        with blaming_file(self.file, group):
-            return tuple(self.file[group]) if group in self.file else ()
+        return dataset_names(self.file, group)
 
     @property
     def times(self) -> np.ndarray:
@@ -207,11 +206,8 @@ class Results(metaclass=checks.KnownKeywords):
 
     def _rows(self, k: int) -> slice:
         """The rows of a frame's cells."""
-        start, counts = int(self._read("frames/first_row", k)), self._read("frames/counts", k)
-        rows = slice(start, start + int(counts.sum()))
-        if (counts < 0).any() or not 0 <= start <= rows.stop <= len(self.file["cells/uid"]):
-            raise InputError(f"{self.path} is damaged: frame {k} has {rows.stop - start} cells.")
-        return rows
+        first, sizes = spans(self, [k])
+        return slice(int(first[0]), int(first[0] + sizes[0]))
 
     def next_uid(self, frame: int = -1) -> np.ndarray:
         """(B,) the uid that the next cell born in each colony gets."""

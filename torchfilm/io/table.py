@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from torchfilm.io.blocks import Block, blocks
 from torchfilm.io.parameters import column_names
 from torchfilm.physics import capsule
 from torchfilm.state import CELL, COLONY, OUTSIDE, State
@@ -53,29 +54,34 @@ class Tables:
 
     def __call__(self, frames: Sequence[int], keep: Keep | None = None) -> dict[str, np.ndarray]:
         """The columns of some frames, in order, for all cells or for those to `keep`."""
-        parts = [self._frame(k, keep) for k in frames]
+        parts = [self._block(some, keep) for some in blocks(self.results, frames)]
         return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
 
-    def _frame(self, k: int, keep: Keep | None) -> dict[str, np.ndarray]:
-        results, found = self.results, self.results.frame(k)
-        signals = results.signals_at_cells(k)
+    def _block(self, frames: Sequence[int], keep: Keep | None) -> dict[str, np.ndarray]:
+        """The columns of frames in which the parameters of colonies are the same."""
+        results, block = self.results, Block(self.results, frames)
+        found, signals, which = block.cells(), block.signals(), block.which
+        of_colonies = block.colony_fields(found["colony"])
         if keep is not None:
             rows = keep(results.colony_id[found["colony"]], found["uid"])
-            found = {name: x[rows] for name, x in found.items()}
-            signals = {name: x[rows] for name, x in signals.items()}
-        place, time = found["colony"], float(results.times[k])
+            found, signals, of_colonies = (
+                {name: x[rows] for name, x in part.items()}
+                for part in (found, signals, of_colonies)
+            )
+            which = which[rows]
+        place, time = found["colony"], results.times[block.frames][which]
         found |= {"colony": results.colony_id[place]}
         born = self.lineage.born[self.lineage.rows(found["colony"], found["uid"])]
         columns = {
-            "frame": np.full(len(place), k),
+            "frame": block.frames[which],
             **_of_cells(time, found, self.internals),
             "age": time - born,
             "born": born,
         }
-        fields = found | {n: x[place] for n, x in results.colony_fields(k).items()}
+        fields = found | of_colonies
         hidden = set() if self.internals else results.internal_fields
         columns |= _of_fields({n: x for n, x in fields.items() if n not in hidden}, signals)
-        values = results.parameters(k)
+        values = results.parameters(frames[0])
         for path, name in column_names(list(values), set(columns)).items():
             columns[name] = values[path][place]
         return columns
@@ -106,11 +112,11 @@ def cell_table(state: State, *, internals: bool = False) -> dict[str, np.ndarray
 
 
 def _of_cells(
-    time: float, found: Mapping[str, np.ndarray], internals: bool
+    time: float | np.ndarray, found: Mapping[str, np.ndarray], internals: bool
 ) -> dict[str, np.ndarray]:
     """The columns that all cells have."""
     return {
-        "time": np.full(len(found["uid"]), time),
+        "time": np.broadcast_to(time, len(found["uid"])).copy(),
         "colony": found["colony"],
         "cell": found["uid"],
         "parent": found["parent"],
