@@ -60,7 +60,7 @@ def colony(rate=1.0, division=4.0, variation=0.1, make=5.0):
 def write_table(path: Path) -> int:
     """Writes the table of the hidden colonies; returns its number of cells."""
     scene = colony(**TRUTH)
-    *_, state = tf.simulate(scene, until=HOURS, colonies=COLONIES, seed=SEED)
+    state = tf.simulate(scene, until=HOURS, colonies=COLONIES, seed=SEED).last()
     angle = torch.rad2deg(torch.atan2(state.axis[:, 1], state.axis[:, 0]))
     columns = {
         "colony": state.colony,

@@ -84,7 +84,7 @@ def table(count: int) -> None:
 
 
 def picture() -> None:
-    *_, state = tf.simulate(tf.scenes.microcolony(), cells=60)
+    state = tf.simulate(tf.scenes.microcolony(), cells=60).last()
     position = state.position.numpy() / PIXEL
     x, y = (position - position.min(0) + 32).T
     shape = (int(y.max()) + 32, int(x.max()) + 32)

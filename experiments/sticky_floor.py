@@ -55,7 +55,7 @@ def main() -> None:
     scene = scene_of(each)
     print("cells, strength (μ·µm²/h): share on the floor, height and radius (µm)")
     for size in SIZES:
-        *_, state = tf.simulate(scene, cells=size, colonies=len(each), seed=SEED)
+        state = tf.simulate(scene, cells=size, colonies=len(each), seed=SEED).last()
         means = measures(state).view(len(STRENGTHS), REPLICATES, -1).mean(1)
         for strength, (share, height, radius) in zip(STRENGTHS, means.tolist(), strict=True):
             print(f"{size:5d}, {strength:3g}: {share:.2f}, {height:4.1f}, {radius:4.1f}")

@@ -34,7 +34,8 @@ def run(act, names=("growth_rate",)) -> tf.State:
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.int64, torch.bool])
 def test_another_type_of_numbers(dtype):
-    wrong = lambda s: s.with_fields(growth_rate=torch.ones(s.cells, dtype=dtype))
+    other = lambda s: torch.ones(s.cells, dtype=dtype)
+    wrong = lambda s: s.replace(fields={**s.fields, "growth_rate": other(s)})
     with pytest.raises(tf.InputError, match=r"Mine\.step gave 'growth_rate' as .* it is float32"):
         run(wrong)
 

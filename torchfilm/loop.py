@@ -39,10 +39,15 @@ def advance(
     the state that it sends.
     """
     while stop is None or not stop(state):
-        state = step(state)
-        for monitor in monitors:
-            seen = monitor(state)
-            state = state if seen is None else seen
+        try:
+            state = step(state)
+            for monitor in monitors:
+                seen = monitor(state)
+                state = state if seen is None else seen
+        except SystemError as error:  # so does an interrupt within a compiled function arrive
+            if isinstance(error.__cause__, KeyboardInterrupt):
+                raise error.__cause__ from None
+            raise
         sent = yield state
         state = state if sent is None else sent
 
@@ -51,8 +56,15 @@ class States(Generator[State, State | None, None]):
     """The states of a run, one after each step. A run of which nobody takes a state has not begun,
     and is warned of."""
 
-    def __init__(self, states: Generator[State, State | None, None]):
-        self._states, self._begun = states, False
+    def __init__(self, states: Generator[State, State | None, None], first: State):
+        self._states, self._begun, self._now = states, False, first
+
+    def last(self) -> State:
+        """The state at the end of the run: the one from which it starts where no step is left. The
+        others are not kept."""
+        for _ in self:
+            pass
+        return self._now
 
     def __next__(self) -> State:
         return self.send(None)
@@ -66,7 +78,8 @@ class States(Generator[State, State | None, None]):
                 " begin with yours, tf.simulate(scene, state)."
             )
         self._begun = True
-        return self._states.send(value)
+        self._now = self._states.send(value)
+        return self._now
 
     def throw(self, *error: Any) -> State:
         self._begun = True
@@ -77,15 +90,15 @@ class States(Generator[State, State | None, None]):
         self._states.close()
 
     def __repr__(self) -> str:
-        begun = "begun" if self._begun else "not begun: take its states, as by `for state in …`"
+        begun = "begun" if self._begun else "not begun: take its states by `for`, or .last()"
         return f"<states of a run that has {begun}>"
 
     def __del__(self) -> None:
         if not getattr(self, "_begun", True):  # a copy that failed has nothing
             warn(
                 "simulate(…) has simulated nothing, since none of its states was taken. Write"
-                " `for state in tf.simulate(…): …`, with `pass` where only the last state, or the"
-                " file of results, is wanted.",
+                " `for state in tf.simulate(…): …`, or tf.simulate(…).last() where only the last"
+                " state, or the file of results, is wanted.",
                 category=RuntimeWarning,
             )
 

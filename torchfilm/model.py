@@ -195,37 +195,37 @@ class Model:
 
     # --- checks --------------------------------------------------------------------------
 
-    def check(self, state: State) -> None:
-        """Raise InputError if this is not a state of this model."""
+    def check(self, state: State, *, values: bool = True) -> None:
+        """Raise InputError if this is not a state of this model. values: look at these, too."""
         if state.dim != self.dim:
             raise checks.input_error("state", f"{state.dim}-D", f"{self.dim}-D, as the scene is")
         there = checks.same_device(state.device, self.batch.device)
         if state.dtype != self.batch.dtype or not there:
+            given, hint = f"{state.dtype} on {state.device}", "Bind the scene to the state:"
             raise checks.input_error(
-                "state",
-                f"{state.dtype} on {state.device}",
-                f"{self.batch.dtype} on {self.batch.device}, as the model is",
-                "Bind the scene to the state: scene.bind(state=state).",
-            )
+                "state", given, f"{self.batch.dtype} on {self.batch.device}, as the model is",
+                f"{hint} scene.bind(state=state).",
+            )  # fmt: skip
         check_declared(state.fields, state.declared)
         columns = {name: getattr(state, name) for name in PER_CELL}
         check_geometry(columns, state.colonies, state.dim, state.dtype)
         state.check_fields()
         highest = int(state.colony_id.max())
-        if highest >= self.batch.colonies and self.scene.per_colony():
-            path, tensor = self.scene.per_colony()[0]
+        if highest >= self.batch.colonies and (several := self.scene.per_colony()):
+            path, tensor = several[0]
             raise checks.InputError(
                 f"{path} has {tensor.numel()} values, but the batch has a colony number {highest}:"
                 " the state is not of this scene."
             )
         for effect in self.effects:
-            effect.check_given(state)
             for name in (*effect.effect.needs(), *(f.name for f in effect.declares())):
                 if name not in state.fields and name not in BUILT_IN:
                     raise checks.InputError(
                         f"{effect.title} needs the field {name!r}, which this state lacks. Make the"
                         " state with this scene: scene.bind(…).start()."
                     )
+            if values:
+                effect.check_given(state)
 
     def check_step(self, dt: float) -> None:
         """Raise InputError for a step that no effect can follow."""
@@ -386,7 +386,7 @@ def bind(
     first = model.trace(None)
     if only is None:  # a part of a scene lacks what the rest of it declares
         binding_checks.check_names(model.effects, scene.declared_by, first)
-    model.check(first)
+    model.check(first, values=check_first)
     for effect in model.effects if check_first else ():
         effect.check(first)
     if check_first and only is None:

@@ -59,7 +59,7 @@ def simulate(
     progress: bool | None = False,
 ) -> States:
     """Run a scene, yielding the state after each step. Nothing is simulated before the states are
-    taken, as by `for state in simulate(…)`.
+    taken: `for state in simulate(…)`, or `simulate(…).last()` for the last alone.
 
     scene: a scene, which is bound here to `colonies` colonies, or a model. seed, streams, device,
     dtype: as in `Scene.bind`, by default 0, stream k for colony k, "cpu" and torch.float32. Where a
@@ -104,7 +104,7 @@ def simulate(
         (*monitors, *((bar,) if bar else ())),
         (*((recorder,) if recorder else ()), *observers, *((bar,) if bar else ())),
     )
-    return States(states)
+    return States(states, state)
 
 
 def _run_bar(model: Model, state: State, cells: int | None, until: float | None) -> RunBar:

@@ -248,17 +248,15 @@ class State:
         return made
 
     def with_fields(self, **values: Tensor) -> State:
-        """A state with some of its fields replaced; each must have been declared."""
+        """A state with some of its fields replaced; each must have been declared. Numbers become
+        those of the field: float64 becomes float32 in a state of float32."""
         if unknown := sorted(values.keys() - self.declared.keys()):
             own = [name for name, field in self.declared.items() if not field.internal]
-            raise checks.input_error(
-                "field",
-                unknown[0],
-                f"declared: {', '.join(own) or 'none'}; parts have replace(position=…)",
-                checks.suggestion(unknown[0], own),
-            )
-        row_checks.check_tensors(values, self.fields, self.device, self._shape_of)
-        return self.replace(fields={**self.fields, **values})
+            rule = f"declared: {', '.join(own) or 'none'}; parts have replace(position=…)"
+            hint = checks.suggestion(unknown[0], own)
+            raise checks.input_error("field", unknown[0], rule, hint)
+        given = row_checks.checked_tensors(values, self.fields, self.device, self._shape_of)
+        return self.replace(fields={**self.fields, **given})
 
     @property
     def _rows(self) -> dict[str, int]:
@@ -409,10 +407,12 @@ class State:
 
     def __repr__(self) -> str:
         colonies = displays.counted(self.colonies, "colony", "colonies")
+        failed = sum(bool(report.status.any()) for report in self.reports.values())
         return (
             f"State({colonies}, {displays.counted(self.cells, 'cell')}, {self.dim}-D,"
-            f" t = {self.time:g} h, step {self.step}, {str(self.dtype)[6:]} on"
-            f" {self.device}, fields: {', '.join(self._own_fields()) or 'none'})"
+            f" t = {self.time:g} h, step {self.step}, {str(self.dtype)[6:]} on {self.device}"
+            f"{', FAILED: see tf.failures(state)' * bool(failed)}"
+            f", fields: {', '.join(self._own_fields()) or 'none'})"
         )
 
     def _repr_html_(self) -> str:

@@ -102,7 +102,7 @@ def followed(
     start = choice.start(first)
 
     def run(scene: tf.Scene) -> tf.State:
-        *_, state = tf.simulate(scene, start, until=start.time + hours)
+        state = tf.simulate(scene, start, until=start.time + hours).last()
         return state
 
     return timed_and_counted(choice, like, run)

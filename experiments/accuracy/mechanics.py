@@ -47,7 +47,8 @@ def _colony(dim: int) -> tf.Scene:
 def colonies(dim: int, quick: bool) -> tuple[tf.Scene, tf.State]:
     """Returns the scene and colonies of about 60 to 100 cells, grown with the default contacts."""
     scene = _colony(dim)
-    *_, state = tf.simulate(scene, colonies=2 if quick else 8, seed=SEED, cells=8 if quick else 64)
+    size = {"colonies": 2 if quick else 8, "cells": 8 if quick else 64}
+    state = tf.simulate(scene, seed=SEED, **size).last()
     return scene, state
 
 

@@ -63,7 +63,7 @@ def measure(case: str, device: str) -> dict:
     """Runs one case. Returns its record."""
     name, colonies, cells = CASES[case]
     scene = scene_of(name, None)
-    *_, state = tf.simulate(scene, colonies=colonies, cells=cells, seed=1)
+    state = tf.simulate(scene, colonies=colonies, cells=cells, seed=1).last()
     kernels, _ = timed(scene.bind(colonies, seed=1), state)
     there = state.to(device)
     copied, _ = timed(scene.bind(colonies, seed=1, device=device), there)

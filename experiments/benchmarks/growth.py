@@ -93,7 +93,7 @@ def grow(name: str, regime: str, backend: str | None, device: str, seed: int, li
     growth = None  # under pressure a colony takes so long that the free one would be too large
     if regime == "free":
         given = {"until": state.time, "colonies": colonies, "seed": seed}
-        *_, free = tf.simulate(scene(dim, None, None), **given)
+        free = tf.simulate(scene(dim, None, None), **given).last()
         growth = round(float(state.volume.sum() / free.volume.sum().to(device)), 4)
     mean, worst = np.array(course).T
     return {

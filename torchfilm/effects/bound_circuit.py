@@ -26,7 +26,7 @@ from torchfilm.circuits.tracing import Untraceable
 from torchfilm.circuits.trial import try_circuit
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.circuit_cells import Kind, cell_column, cell_names, cells_of_type
-from torchfilm.effects.circuit_checks import check_read, warn_of_gradients
+from torchfilm.effects.circuit_checks import check_levels, check_read, warn_of_gradients
 from torchfilm.effects.circuit_daughters import single_genes
 from torchfilm.effects.circuit_kernels import CircuitKernels, PreparedStep, Taken
 from torchfilm.effects.circuit_report import Failures
@@ -61,9 +61,8 @@ class BoundCircuit(BoundEffect):
 
     def __init__(self, effect: Circuit, binding: Binding):
         super().__init__(effect, binding)
-        if kinds := [
-            k for k in effect.rates if isinstance(k, int)
-        ]:  # cells of other types need no constants
+        kinds = [k for k in effect.rates if isinstance(k, int)]
+        if kinds:  # cells of other types need no constants
             self.values = Values({n: self.values[n].needed_by(kinds) for n in self.values})
         self.rates = snapshot(effect.rates, "Circuit.rates", binding.batch)
         self.networks: dict[Kind, run.Network] = {}
@@ -241,6 +240,9 @@ class BoundCircuit(BoundEffect):
         together, circuit = self.plan.transport, self.effect
         dt /= together.medium.steps if together else self.plan.turns
         warn_of_means(circuit.value_owner(), circuit.parameters, dt)
+
+    def check_given(self, state: State) -> None:
+        check_levels(self.effect, state.fields)
 
     @property
     def why_turns(self) -> str:

@@ -79,6 +79,11 @@ class BoundMechanics(BoundEffect):
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         self.drifts = any("drift" in effect.writes() for effect in effects)
 
+    def check_given(self, state: State) -> None:
+        """Soft walls may have given way by more than a cell's radius."""
+        hard = (s for s in self.effect.surfaces() if s.wall.stiffness is None)
+        self.effect.check_behind(state, hard)
+
     def _check_precision(self) -> None:
         """Raise InputError for forces that are wanted more exactly than the states' numbers are."""
         wanted, dtype = self.settings.tolerance, self.binding.batch.dtype

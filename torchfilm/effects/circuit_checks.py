@@ -16,7 +16,7 @@ from torchfilm.circuits.reactions import Reaction
 from torchfilm.signals.schedule import Schedule
 from torchfilm.state import PER_CELL, RESERVED
 from torchfilm.tools import checks
-from torchfilm.tools.row_checks import is_name
+from torchfilm.tools.row_checks import check_field, is_name
 from torchfilm.tools.warn_once import warn
 from torchfilm.values import FORMS
 
@@ -225,6 +225,13 @@ def warn_of_gradients(circuit: Any, networks: Iterable[Any], tracked: bool) -> N
             " whole. Its constants or first values require one; detach them, or take the default"
             " method."
         )
+
+
+def check_levels(circuit: Any, fields: Mapping[str, Tensor]) -> None:
+    """Raise InputError where a state that is given has a level below 0; by other methods one may
+    come there."""
+    for name in circuit.variables.values() if circuit.method in (STIFF, LEAP, DIRECT) else ():
+        check_field(fields, name, lambda x: x < 0, "at least 0")
 
 
 def check_read(circuit: Any, read: set[str]) -> None:

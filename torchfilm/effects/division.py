@@ -33,6 +33,7 @@ from torchfilm.state import CELL, Births, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets, repeated
 from torchfilm.tools.reads import numbers, rows_where
+from torchfilm.tools.row_checks import check_field
 from torchfilm.tools.vectors import nearest_root
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, physical, smallest
 
@@ -247,6 +248,9 @@ class _BoundDivision(BoundEffect):
         super().__init__(effect, binding)
         name = effect.criterion
         self.drawn = None if name is None else evenly_drawn(self.values[name])
+
+    def check_given(self, state: State) -> None:
+        check_field(state.fields, "division_threshold", torch.isnan, "a number, or inf: never")
 
     def step(self, state: State, dt: float) -> State:
         size = self.effect.size(state)

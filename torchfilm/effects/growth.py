@@ -16,7 +16,7 @@ from torchfilm.resolver import Values
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.doubling import check_doubling
-from torchfilm.tools.row_checks import check_variable
+from torchfilm.tools.row_checks import check_field, check_variable
 from torchfilm.tools.warn_once import warn
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, numbers, physical
 
@@ -305,6 +305,9 @@ class _BoundGrowth(BoundEffect):
                 f" {math.log(2.0) / usual:.0f} h. Rates are per hour; a rate per minute is to"
                 f" be multiplied by 60 ({60 * usual:g})."
             )
+
+    def check_given(self, state: State) -> None:
+        check_field(state.fields, "growth_rate", lambda x: x < 0, "at least 0 (1/h)")
 
     def warn_of_others(self) -> None:
         """Warn where a growth rate has no effect since an effect sets another one."""

@@ -279,7 +279,17 @@ class Mechanics(Effect):
             )  # fmt: skip
         for kind in self.adhesion:
             check_variables("Adhesion", state, adhesin=kind.adhesin, partner=kind.partner)
-        for surface in self.surfaces():
+        self.check_behind(state, self.surfaces())
+        cells, ids = (state.position, state.axis, state.length, state.radius), state.own_colony_id
+        check_room(self.surfaces(), state.position, state.radius, ids)
+        if check_fits(self.surfaces(), state.position, *cells[2:], ids, state.uid):
+            check_turned(self.surfaces(), *cells, ids, state.uid)
+        check_apart(*cells, state.colony, state.colony_id, state.uid, space)
+
+    @staticmethod
+    def check_behind(state: State, surfaces: Iterable[Surface]) -> None:
+        """Raise InputError for a cell whose centre lies behind a wall."""
+        for surface in surfaces:
             distance, _ = surface.gap_of_points(state.position, state.own_colony_id)
             behind = torch.nonzero(distance < 0).squeeze(1)
             if behind.numel():
@@ -291,11 +301,6 @@ class Mechanics(Effect):
                     f" {-float(distance[k]):.3g} µm behind it (cells behind it: {behind.numel()})."
                     f" {surface.wall.turn_hint}"
                 )
-        cells, ids = (state.position, state.axis, state.length, state.radius), state.own_colony_id
-        check_room(self.surfaces(), state.position, state.radius, ids)
-        if check_fits(self.surfaces(), state.position, *cells[2:], ids, state.uid):
-            check_turned(self.surfaces(), *cells, ids, state.uid)
-        check_apart(*cells, state.colony, state.colony_id, state.uid, space)
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         return (BoundMechanics(self, binding),)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NoReturn
 
 import numpy as np
 import torch
@@ -28,6 +29,12 @@ class UnknownSignal(checks.InputError, KeyError):
 
 class Signals(dict[str, Tensor]):
     """Values of signals by name."""
+
+    def __setitem__(self, name: str, value: object) -> NoReturn:
+        raise checks.InputError(
+            f"signals[{name!r}] cannot be set: a state stays as it is. Make another:"
+            f" state = state.with_fields(**{{'out.{name}': …}})."
+        )
 
     def __missing__(self, name: str) -> Tensor:
         raise UnknownSignal(

@@ -276,11 +276,11 @@ def value(
     if given.dim() > 1 or not (
         given.is_floating_point() or given.dtype in (torch.int32, torch.int64)
     ):
-        raise input_error(
-            name, tuple(given.shape), "one number, or a 1-D tensor with one number per colony"
-        )
-    if not given.is_floating_point():
-        given = given.double()
+        rule = "one number, or a 1-D tensor with one number per colony"
+        raise input_error(name, tuple(given.shape), rule)
+    # an optimiser changes what has a gradient in place, and the scene is to follow; nothing else
+    given = given if given.requires_grad else given.clone()
+    given = given if given.is_floating_point() else given.double()
     detached = given.detach()
     good = torch.isfinite(detached) & (detached > above) & (detached >= least) & (detached <= most)
     if not bool(good.all()):

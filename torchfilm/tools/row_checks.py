@@ -137,19 +137,25 @@ def check_geometry(columns: Mapping[str, Any], colonies: int, dim: int, dtype: A
             raise checks.input_error(f"state.{name}[{k}]", columns[name][k].item(), rule)
 
 
-def check_tensors(
+def checked_tensors(
     values: Mapping[str, Any],
     present: Mapping[str, Tensor],
     device: torch.device,
     shape: Callable[[str], Sequence[int]],
-) -> None:
-    """Raises InputError for a field's new values that are no tensor, not on the state's device, or
-    not of the shape and kind of those that are present. shape: that a field should have; it is
-    asked where it has changed."""
+) -> Mapping[str, Tensor]:
+    """A field's new values, of the kind of those that are present. Raises InputError for what is no
+    tensor, not on the state's device, of another shape, or of a kind that loses something. shape:
+    that a field should have; it is asked where it has changed."""
+    found = values
     for name, value in values.items():
         if not isinstance(value, Tensor):
             rule = "a tensor with a row for each cell, colony or voxel"
-            raise checks.input_error(f"the field {name!r}", value, rule)
+            now = present.get(name)
+            hint = "" if now is None else (
+                f"One number for all: torch.full_like(state.{name}, …); from a list or an array:"
+                f" torch.as_tensor(…, dtype={now.dtype}, device=state.device)."
+            )  # fmt: skip
+            raise checks.input_error(f"the field {name!r}", value, rule, hint)
         if value.device != device:
             what, hint = f"device of the field {name!r}", "Make it with device=state.device."
             raise checks.input_error(what, str(value.device), f"{device}, as the state is", hint)
@@ -162,11 +168,20 @@ def check_tensors(
             hint = hint if len(wanted) == value.dim() == 1 else ""
             shown = tuple(value.shape)
             raise checks.input_error(f"shape of the field {name!r}", shown, rule, hint)
-        if name.startswith("out.") and value.dtype != now.dtype:
-            hint = f"Convert it: value.to({now.dtype})."
-            raise checks.input_error(
-                f"type of the field {name!r}", value.dtype, f"{now.dtype}, as the signals are", hint
-            )
+        if value.dtype != now.dtype:
+            found = {**found, name: _of_kind(name, value, now.dtype)}
+    return found
+
+
+def _of_kind(name: str, value: Tensor, dtype: torch.dtype) -> Tensor:
+    """The values of a field as numbers of another kind: floats as other floats, whole numbers as
+    any. Raises InputError where that loses a fraction, or reads a number as a truth."""
+    truth, whole = dtype == torch.bool, not dtype.is_floating_point
+    if (whole and value.is_floating_point()) or truth != (value.dtype == torch.bool):
+        wanted = "true or false, torch.bool" if truth else f"numbers of {dtype}"
+        hint = "Convert it: value > 0." if truth else f"Convert it: value.to({dtype})."
+        raise checks.input_error(f"type of the field {name!r}", value.dtype, wanted, hint)
+    return value.to(dtype)
 
 
 def check_fields(
@@ -190,6 +205,15 @@ def check_signals(fields: Mapping[str, Tensor]) -> None:
         if name.startswith("out.") and bool((wrong := ~(value >= 0)).any()):
             bad = float(value[wrong][0])
             raise checks.input_error(f"the field {name!r}, a signal,", bad, "0 or more everywhere")
+
+
+def check_field(
+    fields: Mapping[str, Tensor], name: str, wrong: Callable[[Tensor], Tensor], rule: str
+) -> None:
+    """Raise InputError where a field of a state that is given has a value that is wrong."""
+    if name in fields and bool((found := wrong(fields[name])).any()):
+        k = int(found.nonzero()[0])
+        raise checks.input_error(f"state.{name}[{k}]", float(fields[name][k]), rule)
 
 
 def check_none_taken(owner: str, state: Any, taken: Any, why: str) -> None:
