@@ -109,9 +109,11 @@ class Best:
         return displays.card("Best design", displays.table(rows, head), displays.pairs(losses))
 
     def scene(self) -> tf.Scene:
-        """The scene with these parameters, for one colony or any number of them."""
-        family = self.objective.task.family
-        return family.function(**family.fixed, **self.values)
+        """The scene with these parameters, for one colony or any number of them; of several
+        conditions under the first."""
+        task = self.objective.task
+        given = {**task.family.fixed, **self.values, **task.target.arguments[0]}
+        return task.family.function(**given)
 
     def save(self, path: str | Path) -> Path:
         """Write the design to a `.json` file, which `torchfilm run` and `load_design` take.

@@ -44,9 +44,10 @@ RESAMPLES = 2000
 class Finals(metaclass=checks.KnownKeywords):
     """How the best designs of a search are tested on fresh seeds.
 
-    share: of the budget that the test takes, below 1. most: finalists; fewer where the budget is
-    small. sizes: of the colonies, as shares of the full size, such as (1, 2): each seed is grown at
-    each size, and its loss is the worst of them. Raises InputError for values that are not allowed.
+    share: of the budget that the test takes, at most 0.9. most: finalists, of a front twice as
+    many; fewer where the budget is small. sizes: of the colonies, as shares of the full size, such
+    as (1, 2): each seed is grown at each size, and its loss is the worst of them. Raises InputError
+    for values that are not allowed.
     """
 
     share: float = 0.2

@@ -79,10 +79,10 @@ def infer(
     than the data allow. prior: what is known before, by the names of parameters: for a number a
     frozen distribution of scipy.stats, for a choice the share of each option (`Prior`). path: a
     file that keeps the simulations, also for other data of the same statistics; what is learnt is
-    kept beside it, and the same again takes seconds. samples: of the posterior. flows, epochs: of
-    the estimator; more are less sure. executor: of `concurrent.futures`. progress: as for
-    `Search.run`. Raises the errors of `Task`, and InputError where sbi is missing (the `infer`
-    extra), for the file of other simulations, and where fewer than 50 succeed.
+    kept beside it, and the same again takes seconds. samples: of the posterior. flows: of the
+    estimator; more are less sure. epochs: at most so many. executor: of `concurrent.futures`.
+    progress: as for `Search.run`. Raises the errors of `Task`, and InputError where sbi is missing
+    (the `infer` extra), for the file of other simulations, and where fewer than 50 succeed.
     """
     require_sbi()
     data = checked_data(observed)

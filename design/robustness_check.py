@@ -62,13 +62,13 @@ def check_robustness(
     0.5 and 2, and none where colonies end when data were observed. change: each parameter alone at
     value·(1 ± change), or at the bound that this exceeds; a whole number at its neighbours, a
     choice at each other option. vary: all parameters at once, as where parts are uncertain: as many
-    variants as seeds, each number times its own exp(vary · normal number), within its bounds, on
-    four of the streams in turn; 0 leaves them out. samples: a power of two, for Sobol' indices over
-    the whole space (Saltelli et al. 2010; scipy.stats.sobol_indices) of the mean loss on the
-    searched streams, where a failed colony counts with its loss. They cost samples·(D + 2)·R
-    colonies; 0 leaves them out. threshold: a loss that is good enough; the result gives the share
-    of seeds that reach it. executor, work_items: as in `Objective.evaluate`. Raises InputError for
-    an argument that is not allowed.
+    variants as seeds, each number but whole ones times its own exp(vary · normal number), within
+    its bounds, on four of the streams in turn; 0 leaves them out. samples: a power of two, for
+    Sobol' indices over the whole space (Saltelli et al. 2010; scipy.stats.sobol_indices) of the
+    mean loss on the searched streams, where a failed colony counts with its loss. They cost
+    samples·(D + 2)·R colonies; 0 leaves them out. threshold: a loss that is good enough; the result
+    gives the share of seeds that reach it. executor, work_items: as in `Objective.evaluate`. Raises
+    InputError for an argument that is not allowed.
     """
     if not isinstance(getattr(best, "objective", None), Objective):
         raise checks.input_error("best", best, "the design that a search returned, a Best")

@@ -148,7 +148,8 @@ class Search(TaskOptions):
         progress: bool | None = None,
     ) -> Best | Any:  # Any: a Front, so that who has one goal need not ask which it is
         """Search until `colonies` have been simulated, and return the best design; with several
-        goals, the front of those that none exceeds in all.
+        goals, the front of those that none exceeds in all. It ends early where every colony of a
+        quarter of them failed.
 
         colonies: each replicate of each design counts as one, a smaller colony as its share of the
         full size; no more are grown. The last of them go to the finals: the best designs on fresh
@@ -338,9 +339,8 @@ class Search(TaskOptions):
         self.objective.task.space.values(point)  # raises InputError for what is no point
         losses = self.study.scored(point)
         if losses is None:
-            raise checks.input_error(
-                "point", point.tolist(), "of a design that was grown to full size"
-            )
+            rule = "of a design that was grown to full size"
+            raise checks.input_error("point", point.tolist(), rule)
         return self._design(point, losses)
 
     def _design(self, point: np.ndarray, losses: np.ndarray) -> Best:

@@ -49,7 +49,9 @@ class TaskOptions(metaclass=checks.KnownKeywords):
     scene: a function from parameters to a `tf.Scene`, or the name of a ready scene. parameters:
     those that are searched. target: the pattern that is scored. targets: several goals instead, for
     a front of designs. fixed: further arguments of the scene function. cells, until: a colony ends
-    at `cells` cells or at `until` h, whichever comes first. replicates: colonies of each design.
+    at `cells` cells or at `until` h, whichever comes first; one that has fewer than half of `cells`
+    then, or than its target needs (10 for patterns), has failed. Of data with a time both may be
+    left out. replicates: colonies of each design.
     Replicate k of every design follows stream k of random numbers, so that designs are compared on
     equal terms. reduce: how the losses of the replicates become one loss: "mean", "worst", or a
     quantile such as 0.75. seed, dt (h, by default the scene's), dtype, device: as for

@@ -382,3 +382,16 @@ def test_values_are_of_a_state(tmp_path):
         pass
     with pytest.raises(tf.InputError, match=r"values.*left out for results"):
         tf.show(tmp_path / "a.h5", values={"a": [1.0]})
+
+
+@pytest.mark.parametrize("limits", [{"gfp": (0.0, 4.0)}, {"nope": (0.0, 4.0)}])
+def test_limits_of_the_default_colour(limits):
+    """It is known from the first frame alone."""
+    rates = lambda u, s, p, cell: {"gfp": 1.0 - u.gfp}
+    scene = tf.Scene(tf.Circuit(rates, species=("gfp",)), dim=2, dt=0.1)
+    state = tf.simulate(scene, until=0.5).last()
+    if "gfp" in limits:
+        assert tf.show(state, limits=limits)
+    else:
+        with pytest.raises(tf.InputError, match=r"limits = 'nope'.*a drawn quantity: 'gfp'"):
+            tf.show(state, limits=limits)

@@ -404,3 +404,8 @@ def test_a_table_of_all_frames_is_that_of_each(tmp_path, monkeypatch, most):
         )
     rates = {c: set(whole["rate"][whole["colony"] == c]) for c in (0, 1)}
     assert rates == {0: {0.8}, 1: {1.0, 1.5}}
+
+
+def test_the_correlation_of_a_distribution_is_named_with_it():
+    paths = ["Growth.rate.median", "Growth.rate.inherited"]
+    assert list(column_names(paths, set()).values()) == ["rate.median", "rate.inherited"]

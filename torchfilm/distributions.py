@@ -18,7 +18,8 @@ TAIL = 4.0  # standard deviations, beyond which draws are folded back
 
 @dataclass(frozen=True, eq=False)
 class Uniform(Distribution):
-    """Uniform between low and high; each one number or one per colony."""
+    """Uniform between low and high; each one number or one per colony. inherited: True, daughters
+    have their parent's value."""
 
     low: checks.Value
     high: checks.Value
@@ -46,7 +47,8 @@ class Uniform(Distribution):
 @dataclass(frozen=True, eq=False)
 class Normal(Distribution):
     """Gaussian of mean and sd; each one number or one per colony. Its tails beyond 4 sd (one draw
-    in 16,000) are folded back inside."""
+    in 16,000) are folded back inside. inherited: True, daughters have their parent's value; or the
+    correlation of parent and daughter, from 0 to 1."""
 
     mean: checks.Value
     sd: checks.Value
@@ -80,7 +82,8 @@ class Normal(Distribution):
 @dataclass(frozen=True, eq=False)
 class LogNormal(Distribution):
     """The exponential of a Gaussian: its median, and sigma, the standard deviation of its
-    logarithm; each one number or one per colony."""
+    logarithm; each one number or one per colony. Tails beyond 4 sigma are folded back inside.
+    inherited: as of `Normal`."""
 
     median: checks.Value
     sigma: checks.Value

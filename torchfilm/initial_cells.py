@@ -413,7 +413,7 @@ def _array(name: str, given: Any, dtype: type) -> np.ndarray:
     """An array of finite numbers, or InputError."""
     try:
         given = without_gradient(f"Cells.{name}", given)
-        values = np.asarray(given, dtype=dtype).copy()  # the caller may change its own
+        values: np.ndarray = np.asarray(given, dtype=dtype).copy()  # the caller may change its own
     except (TypeError, ValueError) as error:
         raise checks.input_error(f"Cells.{name}", given, "an array of numbers") from error
     bad = np.argwhere(~np.isfinite(values))

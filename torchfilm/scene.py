@@ -124,7 +124,7 @@ class Scene(metaclass=checks.KnownKeywords):
 
     @property
     def fingerprint(self) -> str:
-        """A hexadecimal word, equal for scenes that simulate the same."""
+        """A hexadecimal word, equal for scenes that simulate the same and have one name."""
         return digest(self.effects, self.drawn_from, self.dim, self.dt, self.name)
 
     @property

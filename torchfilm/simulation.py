@@ -70,8 +70,9 @@ def simulate(
     Recorder. observers: called with the first state and after every step; one that has `close()`,
     such as a `LivePlot`, is closed at the end. progress: True shows a bar with hours or doublings,
     cells and speed (it needs tqdm, the `app` extra); None shows it in a notebook and on a terminal
-    only. on_failure: "raise" a SimulationError that names the colonies that failed (a solve that
-    did not converge, a cell too short to divide), or "drop" their cells, note it, and continue.
+    only. timings: a `tf.Timings`, to which the seconds of each effect are added. on_failure:
+    "raise" a SimulationError that names the colonies that failed (a solve that did not converge, a
+    cell too short to divide), or "drop" their cells, note it, and continue.
     """
     after_fork()
     _check_kinds("simulate", scene, state)
@@ -215,8 +216,10 @@ def rollout(
     So nothing that the scene reads may change before the gradient is taken: call `backward` before
     the step of an optimiser. On the CPU, and where torch is deterministic, steps that do not repeat
     then are an error.
-    scene: or a model, or a `Replay`, whose steps are as long as its recording's. state: from which
-    to start; by default the first. Failures are raised as in `simulate`.
+
+    scene: or a model, or a `Replay`, whose steps are as long as its recording's.
+    state: from which to start; by default the first. dt: h, by default the scene's. Failures are
+    raised as in `simulate`.
     """
     _check_kinds("rollout", scene, state, Replay)
     dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)

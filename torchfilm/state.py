@@ -361,7 +361,7 @@ class State:
     def detach(self) -> State:
         """The same state without the derivatives that it carries, as where a backward pass is cut
         off: also without those of columns such as growth_rate, by which derivatives by Growth.rate
-        go on."""
+        go on; and without births, ends and reports of its step."""
         cut = self.moved(lambda part: part.detach() if isinstance(part, Tensor) else part)
         return cut.replace(births=(), ended=(), reports={})
 

@@ -16,10 +16,10 @@ MOST = 100_000  # designs
 @dataclass(kw_only=True, eq=False)
 class Exhaustive(AskTell):
     """Every design of a space once: for choices and whole numbers alone. The search then ends, and
-    its finals take all that is left of the budget, whatever their share.
+    its finals take all that is left of the budget, up to 0.9 of it, whatever their share.
 
     batch: designs in a batch. Choices that exclude each other (`resolve`) make some designs twice.
-    Raises InputError for a parameter without levels.
+    Raises InputError for a parameter without levels, and for more than 100,000 designs.
     """
 
     batch: int = 64

@@ -296,8 +296,8 @@ class Spread(Several):
         return self.losses(state, history)[:, 0]
 
     def reduced(self, losses: np.ndarray) -> np.ndarray | None:
-        """Seeds that all fail, or all break a constraint, are alike, and no goal: the design has
-        the worst of their losses."""
+        """Where a seed fails or breaks a constraint, the design has the worst of their losses:
+        seeds that all do are alike, and no goal."""
         wide = losses.std(1, ddof=1) if losses.shape[1] > 1 else np.zeros(len(losses))
         wide = np.where((losses >= Constrained.BROKEN).any(1), losses.max(1), wide)
         return np.where((losses == self.failed).any(1), self.failed, wide)

@@ -144,8 +144,8 @@ def _brightness(path: str | Path) -> np.ndarray:
         from matplotlib.image import imread
     except ModuleNotFoundError as error:
         raise tf.InputError(
-            f"Image.load reads {path} by matplotlib, which is not installed: pip install"
-            ' "torchfilm[app]", or give a CSV file.'
+            f"Image.load reads {path} by matplotlib, which is not installed:"
+            f" {checks.install('app')}. Or give a CSV file."
         ) from error
     pixels = imread(path)
     levels = pixels / 255.0 if pixels.dtype.kind == "u" else pixels.astype(np.float64)

@@ -112,12 +112,12 @@ class Observed(Target):
         """The target of a table with one row for each cell: a CSV file with a header, or columns
         by name (a dictionary, or a pandas.DataFrame).
 
-        Columns, of which any may be missing: x and y, the centre; length; radius; angle; age;
-        colony, which tells replicates apart; and those that `species` names: others are not
-        compared. columns: their names in the table where they differ, such as {"x": "centroid_x"}.
-        Units stand in the names of columns (x_um or x_px, angle_deg or angle_rad, age_h or age_min)
-        or in arguments: pixel_size, µm a pixel; length_unit "um"; angle_unit "degrees" or
-        "radians"; time_unit "h" or "min".
+        Columns, of which any may be missing: x and y, the centre; length; angle; age; colony,
+        which tells replicates apart; and those that `species` names: others are not compared.
+        columns: their names in the table where they differ, such as {"x": "centroid_x"}. Units
+        stand in the names of columns (x_um or x_px, angle_deg or angle_rad, age_h, age_min or
+        age_s) or in arguments: pixel_size, µm a pixel; length_unit "um"; angle_unit "degrees" or
+        "radians"; time_unit "h", "min" or "s". A column `radius` tells of cells of another width.
 
         length_with_caps: lengths include the caps, as masks measure them. relative: levels count
         relative to their mean in the colony, for a reporter in arbitrary units. amounts: levels are

@@ -310,3 +310,18 @@ def test_what_takes_one_plain_number_is_no_condition():
         Task(lambda n=20, k=1.0: crowd(n), [Parameter("k", 0.5, 2.0)], several, until=0.2)
     with pytest.raises(tf.InputError, match="makes of it what it stands for, such as a value of a"):
         Conditions([({"light": tf.Schedule({0: 1.0})}, cells), ({"light": 1.0}, cells)])
+
+
+def needs(strength, basal, iptg):
+    return gate(strength, basal, iptg)
+
+
+def test_the_scene_of_a_design_is_under_the_first_condition(tmp_path):
+    """In the session of the search as in another; an argument may have no default."""
+    task = {"until": 0.5, "replicates": 1, "method": "sobol", "finals": None}
+    made = Search(needs, MAKE, Conditions([({"iptg": 0.3}, DARK), ({"iptg": 10.0}, LIT)]), **task)
+    best = made.run(8, progress=False)
+    saved = load_design(best.save(tmp_path / "best.json"), scene=needs)
+    circuit = best.scene().effects[-1]
+    assert circuit.parameters["iptg"] == 0.3
+    assert best.scene().fingerprint == saved.scene().fingerprint

@@ -33,13 +33,13 @@ class Reaction(metaclass=checks.KnownKeywords):
     rate: a constant (a number, one per colony, or a parameter's name) gives mass action, rate × Π
     concentration^order over the consumed species. A function (u, s, p, cell) -> (n,) gives conc/h.
     Its arguments are names for columns over cells: species, signals outside, parameters, geometry.
+    order: the highest power of a concentration in such a function.
     """
 
     consumes: Mapping[str, int]
     produces: Mapping[str, int]
     rate: Constant | RateFunction
     name: str = ""
-    # the highest power of a concentration in a rate function
     order: int = field(default=2, kw_only=True)
 
     def __post_init__(self) -> None:

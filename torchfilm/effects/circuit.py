@@ -64,7 +64,8 @@ class Circuit(Effect):
     reactions and parts. Or a dict of either by cell type, {0: …, 1: …}: other types have no
     reactions. species: names. initial: concentrations at the start by name, 0 without. daughters:
     "concentration", they have their parent's (the paper's way; the two new caps make both together
-    smaller than it was), "amount", its molecules are shared by volume and none is lost. replicated:
+    smaller than it was), "amount", its molecules are shared by volume and none is lost; where
+    molecules are counted, they are always shared, by chance. replicated:
     names of species of which each daughter has as many molecules as the parent, as of genes, which
     are replicated before a division. method:
     "rosenbrock" (stiff, adaptive for each cell), "euler", "midpoint", "heun2", "heun3", "rk4"

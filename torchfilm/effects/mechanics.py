@@ -54,7 +54,8 @@ class Mechanics(Effect):
 
     walls: what confines them. periodic: the faces of axes along which space is periodic, µm, such
     as {"x": (0, 40)}: what is pushed out at one face comes in at the other, and cells push each
-    other across. Cells must stay shorter than half of the way; only one-sided contacts have it.
+    other across. Cells with their caps, and with what contacts reach, must stay shorter than half
+    of the way; only one-sided contacts have it.
     dim: 3, or 2 for strict 2-D (four degrees of freedom; nothing can leave the plane).
 
     viscosity: μ. length_drag: γ, resistance to a change of length, in the unit of μ × µm; it does

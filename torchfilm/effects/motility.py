@@ -73,9 +73,9 @@ class Motility(Effect):
     the force viscosity · (l + 2r) · speed, μ·µm²/h.
 
     With Mechanics, a cell may move by 0.3 of its radius in a step, and so may its ends by a turn of
-    one standard deviation, (2 · turning · dt)^½ · l/2; such a turn may be 0.2 rad. Raises
-    InputError for a dt with which the first cells would move farther; a colony that comes to it
-    later fails.
+    one standard deviation, (2 · turning · dt)^½ · l/2; in any scene such a turn may be 0.2 rad.
+    Raises InputError for a dt with which the first cells would move farther; a colony that comes to
+    it later fails.
     """
 
     speed: ScheduledValue = physical(unit="µm/h", least=0.0, scheduled=True)
@@ -188,10 +188,11 @@ class BoundMotility(BoundEffect):
         for name, power, found, most, what in limits:
             if found > most * (1.0 + ROUNDING):
                 longest = dt * (most / found) ** power
+                why = "let contacts find whom it meets" if self.meets else "follow its way"
                 raise checks.InputError(
                     f"Motility.{name}: in a step of {dt:g} h a first cell would"
-                    f" {what.format(f'{found:.3g}')}; at most {most:g} let contacts find whom it"
-                    f" meets. Take a dt of at most {_rounded_down(longest)} h."
+                    f" {what.format(f'{found:.3g}')}; at most {most:g} {why}. Take a dt of at most"
+                    f" {_rounded_down(longest)} h."
                 )
 
     def _speed(self, state: State) -> Tensor:

@@ -19,7 +19,9 @@ from torchfilm.io.reading import blaming_file
 from torchfilm.scene import Scene
 
 NOW, UNTIL = "parameters", "parameters_until"
-OF_DISTRIBUTIONS = {n for kind in (Uniform, Normal, LogNormal) for n in kind.parameters}
+OF_DISTRIBUTIONS = {"inherited"} | {
+    n for kind in (Uniform, Normal, LogNormal) for n in kind.parameters
+}
 SLASH = "\u2215"  # in a path, for the "/" that separates HDF5 groups
 
 

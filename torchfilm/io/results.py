@@ -314,7 +314,7 @@ class Results(metaclass=checks.KnownKeywords):
 
         A cell is its number plus 1 in all its frames, 0 is no cell: label − 1 is `cell` of the
         table. 16 bits, or 32 where numbers need them. A pixel belongs to the cell that covers its
-        centre; where two overlap, to the one whose centreline is nearer. pixel_size: µm. colony:
+        centre; where two overlap, to the one in which it lies deeper. pixel_size: µm. colony:
         its id; needed in a run of several. window: two corners, µm, by default the box around the
         colony in all frames and 2 µm more. The first row lies at the greatest y. z: in space, the
         height of the section, µm. Raises InputError for what does not fit.

@@ -66,7 +66,7 @@ def heterozygosity(
 @torch.no_grad()
 def clusters(state: State, gap: float, name: str | None = None) -> Tensor:
     """Which cluster each cell belongs to, (N,) int64: cells hang together where their surfaces are
-    less than `gap` µm apart. Clusters are numbered from 0 in each colony, the largest first, and of
+    at most `gap` µm apart. Clusters are numbered from 0 in each colony, the largest first, and of
     equal ones that with the first cell.
 
     name: a field of whole numbers, as for `strains`: then only cells of one kind hang together.

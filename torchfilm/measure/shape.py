@@ -69,7 +69,8 @@ def aspect_ratio(state: State) -> Tensor:
 
 @of_a_state
 def depth(state: State) -> Tensor:
-    """Extent of each colony along z, caps included, (B,) µm; one cell diameter in 2-D."""
+    """Extent of each colony along z, caps included, (B,) µm; one cell diameter in 2-D, 0 without
+    cells."""
     if state.dim == 2:
         return 2.0 * state.groups.max(state.radius)
     half = 0.5 * state.length * state.axis[:, 2].abs() + state.radius

@@ -17,7 +17,7 @@ from torchfilm.tools.warn_once import warn
 
 # what may be wrong with a region: the words for messages, and whether a capsule can still be fitted
 PROBLEMS = {
-    "tiny": ("smaller than {least_area} pixels", False),
+    "tiny": ("smaller than {least_area} pixels, or one pixel wide", False),
     "pieces": ("in several pieces", False),
     "border": ("at the border of the image, which may cut them off", True),
     "misfit": ("not shaped like a straight capsule (curved, or several cells in one)", True),

@@ -28,7 +28,7 @@ AXES = "xyz"
 class Wall(metaclass=checks.KnownKeywords):
     """The base of all walls.
 
-    stiffness: μ·µm/h; None = hard. weight: D in 0 … 1, the paper's relative weight. At most one of
+    stiffness: μ·µm/h; None = hard. weight: D, the paper's relative weight, above 0. At most one of
     the two; each is one number, one per colony, one per cell type, or a distribution over cells.
     """
 
@@ -109,6 +109,7 @@ class Plane(Wall):
     `Plane(z=-0.5, facing="+z")` keeps cells above z = −0.5 µm. Give one of x, y, z (µm; one number
     or one per colony) with facing "+x" … "-z", or a point and a normal that points towards the
     cells. Point and normal are each one vector, or one per colony as an array of shape (B, d).
+    stiffness, μ·µm/h: of a soft wall. weight: the paper's D, above 0, at most 1. Default: hard.
     """
 
     turn_hint = "Is the wall inside out? Turn it (facing or normal), or move the cell."
@@ -189,7 +190,8 @@ class Plane(Wall):
 class Sphere(Wall):
     """A sphere (a circle in 2-D) that keeps cells inside, or outside with inside=False.
 
-    center: µm, one position or one per colony as an array of shape (B, d). radius: µm.
+    center: µm, one position or one per colony as an array of shape (B, d). radius: µm. stiffness,
+    weight: as of `Plane`.
     """
 
     turn_hint = "Is the wall inside out? Change `inside`, or move the cell."
@@ -217,7 +219,7 @@ class Box(Wall):
     """An axis-parallel box that keeps cells inside.
 
     low, high: opposite corners, µm, each entry one number or one per colony; ±inf leaves a side
-    open.
+    open. stiffness, weight: as of `Plane`.
     """
 
     low: Sequence[float | Tensor]
@@ -245,7 +247,7 @@ class Channel(Wall):
     """A growth channel along x, with walls at y = ±width/2, and in 3-D also at z = ±height/2.
 
     `low_end` and `high_end` close the channel at that x (µm; None = open). height: None = no walls
-    in z.
+    in z. stiffness, weight: as of `Plane`.
     """
 
     width: float | Tensor

@@ -108,6 +108,8 @@ class PlotStyle:
             checked_range(f"limits[{name!r}]", pair)
             if name == ANGLE:
                 raise checks.input_error("limits", name, "left out: its range is 0 to 180°")
+            if self.colour is None and self.channels is None:
+                continue  # it is known from the first frame alone
             if name not in (*self.quantities, self.background, self.signal):
                 drawn = (
                     ", ".join(

@@ -40,7 +40,7 @@ def time_course(
     dpi: float = 160,
 ) -> Picture:
     """Draw the number of cells of each colony against time, and below it the mean of each quantity
-    over its cells; of up to four colonies also the band from 10 to 90 % of the cells.
+    over its cells; of up to four lines also the band from 10 to 90 % of the cells.
 
     what: a results file, or its path. quantities: fields of the cells, or signals at them as
     "out.NAME". by: a field of whole numbers, such as "cell_type": cells of each are counted apart,

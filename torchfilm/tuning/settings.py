@@ -29,8 +29,9 @@ class Settings(metaclass=checks.KnownKeywords):
     default, take it as contact_overlap = 0.14 · penalty; bilateral ones as alpha = penalty / γ.
     Physically soft cells, `Mechanics(stiffness=…)`, keep their own. tolerance: of the contact
     solve; 0.05 is the default, 0.005 of bilateral contacts. These take it as it is, one-sided ones
-    as 1.4 times as much. passes: of bilateral contacts (see `Mechanics`). rtol: relative tolerance
-    of circuits that use the stiff solver. `torchfilm explain SCENE --settings FILE` prints what a
+    as 1.4 times as much. passes: of bilateral contacts, which are then solved to an overlap of
+    0.02 µm or less (see `Mechanics`). rtol: relative tolerance of circuits that use the stiff
+    solver, and of `MediumReactions`. `torchfilm explain SCENE --settings FILE` prints what a
     scene makes of them.
     """
 
