@@ -64,6 +64,7 @@ ROOMS = {
         (
             "torchfilm.scene",
             "torchfilm.model",
+            "torchfilm.binding",
             "torchfilm.joined_step",
             "torchfilm.cpu_parts",
             "torchfilm.turns",

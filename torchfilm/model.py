@@ -11,20 +11,19 @@ be recorded once (`recorded`), while the others only follow (`following`).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from torchfilm import binding_checks
 from torchfilm.arrivals import with_arrivals
 from torchfilm.cpu_parts import CpuTwins, OnCpu
 from torchfilm.effect import BUILT_IN, DIVISION, FLAGGED_DIVISION, Binding, BoundEffect
-from torchfilm.founders import FirstCells, checked_streams
+from torchfilm.founders import FirstCells
 from torchfilm.initial_cells import Cells
 from torchfilm.joined_step import JoinedStep, joined
 from torchfilm.resolver import BoundBatch
@@ -221,8 +220,8 @@ class Model:
             for name in (*effect.effect.needs(), *(f.name for f in effect.declares())):
                 if name not in state.fields and name not in BUILT_IN:
                     raise checks.InputError(
-                        f"{effect.title} needs the field {name!r}, which this state lacks. Make the"
-                        " state with this scene: scene.bind(…).start()."
+                        f"{effect.title} needs the field {name!r}, which this state lacks. Give it"
+                        " first values: scene.take_over(state). Or begin: scene.bind(…).start()."
                     )
             if values:
                 effect.check_given(state)
@@ -349,83 +348,6 @@ def advanced(state: State, dt: float) -> State:
     state.check_fields()
     time = later(state.time, state.step, dt)
     return state.replace(step=state.step + 1, time=time, dt=dt, span=None)
-
-
-@one_torch_thread()
-def bind(
-    scene: Scene,
-    colonies: int | None = None,
-    *,
-    seed: int = 0,
-    streams: Sequence[int] | Tensor | None = None,
-    cells: Cells | None = None,
-    device: str | torch.device = "cpu",
-    dtype: torch.dtype = torch.float32,
-    state: State | None = None,
-    per_colony: bool = False,
-    only: Collection[int] | None = None,
-    check_first: bool = True,
-) -> Model:
-    """As `Scene.bind`. only: bind only the effects at these places of the scene. check_first:
-    check whether the first cells may be where they are; not needed where a file replaces them."""
-    after_fork()
-    if state is not None:
-        return _bind_to_state(scene, state, only)
-    if cells is not None and not isinstance(cells, Cells):
-        hint = "A state goes on by bind(state=…)." if isinstance(cells, State) else ""
-        raise checks.input_error("cells", cells, "a tf.Cells", hint)
-    founders = cells if cells is not None else scene.founders
-    count = _count(scene, colonies, founders, only)
-    seed = checks.integer("seed", seed, least=0, most=2**63 - 1)
-    checks.float_type("dtype", dtype)
-    if founders.dim != scene.dim:
-        raise checks.input_error("cells", f"{founders.dim}-D", f"{scene.dim}-D, as the scene is")
-    start = FirstCells(count, seed, checked_streams(streams, count), scene, cells)
-    batch = BoundBatch(count, dtype, checks.device(device), _types(start.cells), per_colony)
-    model = Model(scene, batch, start, only)
-    first = model.trace(None)
-    if only is None:  # a part of a scene lacks what the rest of it declares
-        binding_checks.check_names(model.effects, scene.declared_by, first)
-    model.check(first, values=check_first)
-    for effect in model.effects if check_first else ():
-        effect.check(first)
-    if check_first and only is None:
-        binding_checks.warn_of_idle(model.effects, first)
-        binding_checks.warn_of_other_names(first, founders.extra)
-    binding_checks.warn_of_births(model.effects)
-    return model
-
-
-def _bind_to_state(scene: Scene, state: State, only: Collection[int] | None) -> Model:
-    if not isinstance(state, State):
-        raise checks.input_error("state", state, "a State, such as scene.bind(colonies=8).start()")
-    count = max(scene.fixed_colonies if only is None else 1, int(state.colony_id.max()) + 1)
-    # what lists of numbers mean was settled when the state was made
-    batch = BoundBatch(count, state.dtype, state.device, _types(scene.founders), per_colony=True)
-    # by colony id: the places may be others
-    streams = torch.arange(count, device=state.device).index_copy(0, state.colony_id, state.stream)
-    model = Model(scene, batch, FirstCells(count, state.seed, streams, scene, None), only)
-    model.check(state)
-    # what it can be tried on: cells that there are, or else the founders
-    tried = model.trace(model.opened(state, 0.0) if state.cells else None)
-    if only is None:
-        there = (*scene.declared_by, *state.fields)
-        binding_checks.check_names(model.effects, there, tried)
-        binding_checks.warn_of_kept(model.effects, state, scene.founders.extra)
-    return model
-
-
-def _count(
-    scene: Scene, colonies: int | None, founders: Cells, only: Collection[int] | None
-) -> int:
-    fixed = 1 if only is not None else scene.fixed_colonies
-    if colonies is None:
-        return max(fixed, founders.colonies)
-    return founders.batch_size(checks.integer("colonies", colonies, least=1))
-
-
-def _types(founders: Cells) -> tuple[int, ...]:
-    return () if founders.cell_type is None else tuple(sorted({int(k) for k in founders.cell_type}))
 
 
 def _with_given(state: State, wanted: Field) -> State:

@@ -19,9 +19,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchfilm.binding import bind
 from torchfilm.cpu_parts import OnCpu
 from torchfilm.loop import advance
-from torchfilm.model import Model, advanced, bind
+from torchfilm.model import Model, advanced
 from torchfilm.scene import Scene
 from torchfilm.state import CELL, PER_CELL, Births, State
 from torchfilm.tools import checks

@@ -12,11 +12,12 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from torchfilm.binding import bind, taken_over
 from torchfilm.circuits.names import without_medium
 from torchfilm.effect import BUILT_IN, Effect, is_own
 from torchfilm.founders import Founders
 from torchfilm.initial_cells import Cells
-from torchfilm.model import Model, bind
+from torchfilm.model import Model
 from torchfilm.parameters import given, parameters, summary
 from torchfilm.physics.space import PeriodicSpace
 from torchfilm.physics.surfaces import Surface
@@ -192,6 +193,14 @@ class Scene(metaclass=checks.KnownKeywords):
             state=state,
             per_colony=per_colony,
         )
+
+    def take_over(self, state: State) -> State:
+        """A state of another scene, with which this one goes on: `tf.simulate(scene,
+        scene.take_over(state), until=…)`. Fields that it lacks, or that mean something else there,
+        have first values, as founders have; it gets this scene's medium where it has none. All
+        else stays, also fields that only the other scene has. Raises InputError where the two do
+        not fit, as with another dimension or grid."""
+        return taken_over(self, state)
 
     @property
     def fixed_colonies(self) -> int:

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.binding import bind
 from torchfilm.initial_cells import Cells
 from torchfilm.io.identity import check_fields, check_same_scene, declared_fields
 from torchfilm.io.schema import check_frame
-from torchfilm.model import bind
 from torchfilm.scene import Scene
 from torchfilm.signals.grid import Grid
 from torchfilm.state import OUTSIDE, PER_CELL, Field, State

@@ -1,0 +1,112 @@
+"""A scene goes on with a state of another scene."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import torchfilm as tf
+
+DT = 0.05
+BOX = {"box": ((-24.0, -24.0), (24.0, 24.0)), "spacing": 4.0}
+
+
+def green(u, s, p, cell):
+    return {"gfp": p.k - u.gfp}
+
+
+def red(u, s, p, cell):
+    return {"rfp": s.food - u.rfp}, {"food": -0.1 * u.rfp}
+
+
+def ageing(cells):
+    cells.age = cells.age + DT
+
+
+def scene(*effects, division=None, dim=2) -> tf.Scene:
+    division = division or tf.Division(length=4.0)
+    return tf.Scene(tf.Growth(rate=1.0), division, tf.Mechanics(dim=dim), *effects, dt=DT)
+
+
+GREEN = scene(tf.Circuit(green, species="gfp", k=2.0))
+MEDIUM = tf.Medium(food=tf.Signal(10.0, initial=1.0), **BOX)
+OTHER = scene(
+    tf.Circuit(red, species="rfp", initial={"rfp": 0.5}),
+    MEDIUM,
+    tf.Rules(ageing, variables={"age": 0.25}),
+)
+
+
+@pytest.fixture(scope="module")
+def grown() -> tf.State:
+    return tf.simulate(GREEN, until=2.5, colonies=2).last()
+
+
+def test_what_is_lacking_has_first_values_and_all_else_stays(grown):
+    made = OTHER.take_over(grown)
+    assert made.rfp.eq(0.5).all() and made.age.eq(0.25).all()
+    assert made.signals["food"].eq(1.0).all() and made.layout.grid.nodes == 2 * 12 * 12
+    for name, value in grown.cell_columns().items():
+        assert torch.equal(made.cell_columns()[name], value)
+    assert (made.time, made.step, made.seed) == (grown.time, grown.step, grown.seed)
+    assert "rfp" not in grown.fields and grown.layout is None
+
+
+def test_a_run_goes_on_and_back(grown, tmp_path):
+    record = tf.Recorder(tmp_path / "other.h5", OTHER, every=2)
+    there = tf.simulate(OTHER, OTHER.take_over(grown), until=3.5, record=record).last()
+    assert there.age.max().item() == pytest.approx(0.25 + 1.0, rel=1e-5)
+    assert 0.4 < there.rfp.mean().item() < 0.95 and there.signals["food"].mean() < 1.0
+    with tf.Results(tmp_path / "other.h5") as results:
+        again = results.state(OTHER)
+    assert torch.equal(again.rfp, there.rfp) and torch.equal(again.position, there.position)
+    back = tf.simulate(GREEN, GREEN.take_over(there), until=4.0).last()
+    assert 0.9 < back.gfp.mean().item() < 1.1 and torch.equal(back.groups.counts, back.counts)
+
+
+def test_the_same_scene_changes_nothing(grown):
+    """Also in a run that goes on: to the bit."""
+    same = GREEN.take_over(grown)
+    assert {n: x.tolist() for n, x in same.fields.items()} == {
+        n: x.tolist() for n, x in grown.fields.items()
+    }
+    plain, taken = (tf.simulate(GREEN, s, until=3.0).last() for s in (grown, same))
+    assert torch.equal(plain.position, taken.position) and torch.equal(plain.gfp, taken.gfp)
+
+
+def test_a_threshold_of_another_kind_has_first_values(grown):
+    """A length at which cells divide is no length to add."""
+    adder = scene(division=tf.Division(added=1.5))
+    made = adder.take_over(grown)
+    assert made.division_threshold.eq(1.5).all() and torch.equal(made.birth_length, grown.length)
+    last = tf.simulate(adder, made, until=3.5).last()
+    assert last.cells > grown.cells
+
+
+def test_molecules_are_whole_where_they_are_counted(grown):
+    counted = scene(
+        tf.Circuit(
+            [tf.Reaction({}, {"gfp": 1}, 2.0), tf.Reaction({"gfp": 1}, {}, 1.0)], species="gfp",
+            method="tau_leap", molecules_per_unit=20.0,
+        )
+    )  # fmt: skip
+    amounts = (lambda x: x.gfp * x.volume * 20.0)(counted.take_over(grown))
+    assert amounts.round().sub(amounts).abs().max() < 1e-3
+    assert (grown.gfp * grown.volume * 20.0 - amounts).abs().max() <= 1.0
+
+
+def test_states_that_do_not_fit_are_refused(grown):
+    with pytest.raises(tf.InputError, match=r"state = '2-D'.*3-D, as the scene is"):
+        scene(dim=3).take_over(grown)
+    with pytest.raises(tf.InputError, match="a State"):
+        GREEN.take_over(3)
+    there = OTHER.take_over(grown)
+    fine = scene(
+        tf.Circuit(red, species="rfp"), tf.Medium(food=tf.Signal(10.0), box=BOX["box"], spacing=2.0)
+    )
+    with pytest.raises(tf.InputError, match="on another grid, of 4 × 4"):
+        fine.take_over(there)
+    with pytest.raises(
+        tf.InputError, match=r"rules needs the field 'age'.*scene\.take_over\(state\)"
+    ):
+        tf.simulate(scene(tf.Rules(ageing, variables={"age": 0.0})), grown, until=3.0)
