@@ -201,7 +201,8 @@ def test_a_state_on_another_grid_is_not_continued_silently():
 
     state = scene().bind().start()
     for given in ({"spacing": 8.0}, {"box": 80.0}, {"depth": 10.0}):
-        with pytest.raises(tf.InputError, match="on another grid, of 4 × 4 × 1 µm"):
+        words = r"on another grid, of 4 × 4 × 1 µm in the box \[-40\.0, -40\.0, -0\.5\] to \[40\.0"
+        with pytest.raises(tf.InputError, match=words):
             list(tf.simulate(scene(**given), state, until=0.1))
 
 

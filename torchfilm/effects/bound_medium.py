@@ -317,11 +317,14 @@ class GridCoverage(_MediumPart):
             same = all(shape == self.effect.voxels for shape in grid.shapes)
             same = same and all(corner == list(low) for corner in grid.origin.tolist())
         if not same:
+            begin = grid.origin[0].tolist()
+            sides = zip(begin, grid.shapes[0], grid.spacing, strict=True)
+            end = [x + count * side for x, count, side in sides]
             raise checks.InputError(
                 f"Medium has voxels of {' × '.join(f'{h:g}' for h in step)} µm in the box {low} to"
                 f" {high}, but the signals of this state are on another grid, of"
-                f" {' × '.join(f'{h:g}' for h in grid.spacing)} µm: give the box, spacing and depth"
-                " that it was begun with."
+                f" {' × '.join(f'{h:g}' for h in grid.spacing)} µm in the box {begin} to {end}:"
+                " give the box, spacing and depth that it was begun with."
             )
 
     def step(self, state: State, dt: float) -> State:
