@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from torchfilm.io.blocks import Block, blocks
 from torchfilm.io.identity import declared_fields
 from torchfilm.io.results import Results
 from torchfilm.physics import capsule
@@ -20,6 +22,8 @@ from torchfilm.state import OUTSIDE
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 from torchfilm.values import CONCENTRATION
+
+Columns = Mapping[str, np.ndarray]
 
 BIN = 1.0  # µm: the default width of a bin, that of a cell
 ALONG = ("x", "y", "z", "radius")
@@ -56,7 +60,8 @@ def kymograph(
         chosen = ids[0] if colony is None else checks.integer("colony", colony, least=0)
         if chosen not in ids:
             raise checks.input_error("colony", colony, f"one of {', '.join(map(str, ids))}")
-        seen = [_seen(results, k, ids.index(chosen), quantity, along) for k in range(len(results))]
+        each, own = known_quantities(results, quantity), ids.index(chosen)
+        seen = [_seen(cells, known, own, quantity, along) for cells, known in each]
         places = np.concatenate([place for place, _ in seen])
         if not len(places):
             raise checks.InputError(f"colony {chosen} of {results.path} has no cell in any frame")
@@ -92,10 +97,9 @@ def _between(times: np.ndarray) -> np.ndarray:
 
 
 def _seen(
-    results: Results, frame: int, place: int, quantity: str, along: str
+    cells: Columns, known: Columns, place: int, quantity: str, along: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where the cells of a colony are, and what they have of the quantity, at a frame, (N,)."""
-    cells, known = known_quantities(results, frame, quantity)
     mine = cells["colony"] == place
     position, value = cells["position"][mine], known[quantity][mine].astype(float)
     if along != "radius":
@@ -106,14 +110,24 @@ def _seen(
     return np.hypot(*(position - centre)[:, :2].T), value
 
 
-def known_quantities(
-    results: Results, frame: int, *wanted: str
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The cells of a frame, and what it tells of each, (N,) by name, signals at them under
-    "out.NAME". Raises InputError for a wanted name that it does not tell."""
-    cells, signals = results.frame(frame), results.signals_at_cells(frame)
-    known = {n: x for n, x in cells.items() if x.ndim == 1 and n not in results.internal_fields}
-    known |= {OUTSIDE + n: x for n, x in signals.items()}
+def known_quantities(results: Results, *wanted: str) -> Iterator[tuple[Columns, Columns]]:
+    """The cells of each frame, and what it tells of each cell, (N,) by name, signals at them under
+    "out.NAME". Raises InputError for a wanted name that the file does not tell."""
+    hidden = results.internal_fields
+    for part in blocks(results, range(len(results))):
+        block = Block(results, part)
+        cells, signals = block.cells(), block.signals()
+        known = {n: x for n, x in cells.items() if x.ndim == 1 and n not in hidden}
+        known |= {OUTSIDE + n: x for n, x in signals.items()}
+        _check_known(known, signals, wanted)
+        ends = np.searchsorted(block.which, np.arange(len(part) + 1))
+        for first, end in itertools.pairwise(ends):
+            rows = slice(first, end)
+            yield {n: x[rows] for n, x in cells.items()}, {n: x[rows] for n, x in known.items()}
+
+
+def _check_known(known: Columns, signals: Columns, wanted: Sequence[str]) -> None:
+    """Raise InputError for a wanted name that no cell has. signals: at the cells, by name."""
     names = [n for n in known if n not in ("uid", "parent", "colony")]
     for quantity in wanted:
         if quantity not in known:
@@ -121,7 +135,6 @@ def known_quantities(
             if quantity in signals:
                 hint = f"What is outside of cells is {OUTSIDE + quantity!r}."
             raise checks.input_error("quantity", quantity, f"one of {', '.join(names)}", hint)
-    return cells, known
 
 
 def _bins(places: np.ndarray, edges: Sequence[float] | None) -> np.ndarray:

@@ -15,7 +15,7 @@ from torchfilm.pictures.figures import check_not_results, choose_colonies, opene
 from torchfilm.pictures.frames import RecordedFrames
 from torchfilm.pictures.page import checked_dpi
 from torchfilm.pictures.picture import Picture, new_figure
-from torchfilm.pictures.place_and_time import known_quantities, unit_at_cells
+from torchfilm.pictures.place_and_time import Columns, known_quantities, unit_at_cells
 from torchfilm.tools import checks
 
 if TYPE_CHECKING:
@@ -55,7 +55,9 @@ def time_course(
         frames = RecordedFrames(results, range(len(results)))
         most = most if by is None else min(most, len(STYLES))
         places, more = choose_colonies(frames.shown(False), results.colony_id, colonies, most)
-        found = [_seen(results, k, places, by, quantities) for k in range(len(results))]
+        wanted = quantities if by is None else (*quantities, by)
+        each = known_quantities(results, *wanted)
+        found = [_seen(cells, known, places, by, quantities) for cells, known in each]
         lines = _lines(places, sorted({kind for one in found for _, kind in one}), by, frames)
         none = np.full((1 + len(quantities), 3), np.nan)
         seen = np.stack([[one.get((x.place, x.kind), none) for x in lines] for one in found])
@@ -116,11 +118,10 @@ def _lines(
 
 
 def _seen(
-    results: Results, frame: int, places: Sequence[int], by: str | None, names: Sequence[str]
+    cells: Columns, known: Columns, places: Sequence[int], by: str | None, names: Sequence[str]
 ) -> dict[tuple[int, int], np.ndarray]:
     """Of the cells of each place and kind their number, three times, and of each quantity the mean,
     and the ends of the band, (1 + quantities, 3); NaN without cells."""
-    cells, known = known_quantities(results, frame, *(names if by is None else (*names, by)))
     kind = np.full(len(cells["uid"]), ALL) if by is None else known[by]
     if kind.dtype.kind not in "iub":
         raise checks.input_error("by", by, "a field of whole numbers, such as 'cell_type'")
