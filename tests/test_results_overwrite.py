@@ -259,3 +259,16 @@ def test_a_place_where_hdf5_cannot_create_a_file_is_named(tmp_path, monkeypatch)
     monkeypatch.setattr(replacing.h5py, "File", locked)
     with pytest.raises(tf.InputError, match=r"run\.h5.*unable to lock.*HDF5_USE_FILE_LOCKING"):
         recorder(scene.bind().start())
+
+
+def test_a_run_without_a_step_replaces_nothing(old):
+    """As where a cell of a notebook is run again."""
+    scene, before = make_scene(), old.read_bytes()
+    last = tf.simulate(scene, until=UNTIL, colonies=2).last()
+    again = tf.Recorder(old, scene, overwrite=True)
+    with pytest.raises(tf.InputError, match=r"overwrite=True.*run\.h5.*of a run with a step"):
+        tf.simulate(scene, last, until=UNTIL, record=again)
+    assert old.read_bytes() == before
+    new = old.with_name("new.h5")  # a file of one frame is fine where there was none
+    assert tf.simulate(scene, last, until=UNTIL, record=str(new)).last() is last
+    assert len(tf.Results(new)) == 1

@@ -90,9 +90,7 @@ def simulate(
     model.check(state)
     model.check_step(dt)
     model.check_end(state, cells if until is None else None)
-    recorder = _new_recorder(record, model) if isinstance(record, (str, Path)) else record
-    if recorder is not None:
-        recorder.attach(model, dt)
+    recorder = _attached(record, model, dt, _ended(last, cells, state))
     monitors = _monitors(recorder, observers, cells if until is None else None, on_failure, timings)
     bar = _run_bar(model, state, cells, until) if wanted(progress) else None
     first = (*((recorder,) if recorder else ()), *observers)
@@ -113,10 +111,27 @@ def _run_bar(model: Model, state: State, cells: int | None, until: float | None)
     return RunBar(f"{model.scene.name}: {what}", state, cells, until)
 
 
-def _new_recorder(path: str | Path, model: Model) -> Recorder:
-    from torchfilm.io.recorder import Recorder  # loads h5py, which most scripts do without
+def _attached(
+    record: str | Path | Recorder | None, model: Model, dt: float, ended: bool
+) -> Recorder | None:
+    """What records a run. ended: the run has no step."""
+    if isinstance(record, (str, Path)):
+        from torchfilm.io.recorder import Recorder  # loads h5py, which most scripts do without
 
-    return Recorder(path, model.scene)
+        record = Recorder(record, model.scene)
+    if record is not None:
+        _check_overwrite(record, ended)
+        record.attach(model, dt)
+    return record
+
+
+def _check_overwrite(recorder: Recorder, ended: bool) -> None:
+    """Raise InputError where a run without a step would put one frame in the place of a file, as
+    where a cell of a notebook is run again."""
+    if ended and recorder.overwrite and recorder.path.exists():
+        rule = "of a run with a step: the state from which it starts is at its end"
+        hint = "Nothing would be recorded but that state. Give a later until, or an earlier state."
+        raise checks.input_error("Recorder(…, overwrite=True)", str(recorder.path), rule, hint)
 
 
 def _check_options(
