@@ -8,6 +8,8 @@ these is lucky on them, too, so that its loss and band come from other seeds, of
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -236,7 +238,8 @@ class FinalsRun:
     """The finals of one run of a search.
 
     budget: colonies of the whole search, under each condition; executor, work_items: as in
-    `Objective.evaluate`. What is chosen depends on the study and the budget alone, and what the
+    `Objective.evaluate`; deadline: of the clock, s, after which no design is tested for its loss.
+    What is chosen depends on the study and the budget alone, and what the
     study holds is not grown again. So a stopped run goes on where it was.
     """
 
@@ -246,6 +249,7 @@ class FinalsRun:
     budget: float
     executor: Executor | None = None
     work_items: int = 1
+    deadline: float = math.inf
 
     def run(self) -> None:
         """Play all rounds that the budget allows. Several goals have one round, of a front."""
@@ -289,6 +293,8 @@ class FinalsRun:
 
     def _holds(self, point: np.ndarray, wanted: float) -> bool:
         for seeds in HOLDS:
+            if time.monotonic() >= self.deadline:
+                return False
             if not self._grow([point], seeds) or self._loss(seeds, point) > wanted:
                 return False
         found = _fresh(self.task, self.study, self.finals.sizes, point, FIRST_STREAM)

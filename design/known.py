@@ -66,7 +66,8 @@ class KnownDesigns:
         """Those with which a study of the search began, where they are some of these: the files
         from which these come have grown since. Else these, which `Study.check` compares."""
         found = None if self.describe() == study.about.get("start") else _begun(study)
-        if found is None or self.every is None:
+        alike = found is not None and found.points.shape[1] == self.points.shape[1]
+        if found is None or self.every is None or not alike:
             return self
         began, now = (np.concatenate(of.batches) for of in (found, self))
         every = np.concatenate([self.every, now])
@@ -111,8 +112,11 @@ def known_designs(given: Start, task: Task) -> KnownDesigns:
     kept: list[np.ndarray] = []
     grown: list[np.ndarray] = list(values)
     rows: list[tuple[Entry, int]] = []
+    remarks, alone = [], len(studies) == 1
     for study in sorted(studies, key=lambda s: bool(s.why)):  # stable: those that hold first
         new = [k for k in study.chosen if study.points[k].tobytes() not in seen]
+        if words := study.remark(len(new)):
+            remarks.append(f"start: {words}." if alone else f"start: {study.name}: {words}.")
         seen |= {study.points[k].tobytes() for k in new}
         (grown if study.why else kept).extend(study.points[k] for k in new)
         rows += [study.rows[k] for k in new if not study.why]
@@ -128,18 +132,8 @@ def known_designs(given: Start, task: Task) -> KnownDesigns:
         entry=joined(np.array(kept), rows, task) if kept else None,
         given=len(values),
         why="; ".join(dict.fromkeys(s.why for s in studies if s.why)),
-        remark=_remark(studies),
+        remark="\n".join(remarks),
         every=np.concatenate([s.points for s in studies]) if studies else None,
-    )
-
-
-def _remark(studies: Sequence[KnownStudy]) -> str:
-    """What a user should know of the designs of studies, a line for each that has something."""
-    alone = len(studies) == 1
-    return "\n".join(
-        f"start: {s.remark}." if alone else f"start: {s.name}: {s.remark}."
-        for s in studies
-        if s.remark
     )
 
 

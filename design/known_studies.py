@@ -41,16 +41,16 @@ class KnownStudy:
         best = np.argsort([e.loss[k] for e, k in self.rows], kind="stable")
         return [int(k) for k in best[:MOST]]
 
-    @property
-    def remark(self) -> str:
-        """What a user should know of them: which are left out, and why; "" where none is."""
+    def remark(self, taken: int) -> str:
+        """What a user should know of them: which are left out, and why; "" where none is. taken:
+        of those that are chosen, no other study had the rest."""
         words = []
         if beyond := self.known - len(self.points):
             words.append(f"{beyond} of its {self.known} designs lie beyond the bounds")
-        if self.why and len(self.points):
+        if self.why and taken:
             words.append(
-                f"its losses do not hold here ({self.why}), so its {len(self.chosen)} best designs"
-                " are grown again"
+                f"its losses do not hold here ({self.why}), so its {taken} best designs are grown"
+                " again"
             )
         return "; ".join(words)
 

@@ -44,15 +44,16 @@ IN_VAIN, LEAST_IN_VAIN = 0.25, 64
 
 @dataclass(eq=False)
 class SearchProgress:
-    """What a search has found so far. chosen: its method; known: the designs with which its study
-    began; deadline: when it ends, in seconds of the clock; grown: the colonies of designs that were
-    drawn or measured, and scored: the losses of those that only a report needs, by their points."""
+    """What a search has found so far. known: designs with which its study began; deadline: of the
+    clock, s; late: it ended there; grown: colonies of designs that were drawn or measured, and
+    scored: losses of those that only a report needs, by their points."""
 
     study: Study
     why_regrown: str
     chosen: Chosen | None = None
     known: KnownDesigns | None = None
     deadline: float = math.inf
+    late: bool = False
     grown: dict[bytes, list[FinishedColonies]] = field(default_factory=dict)
     scored: dict[bytes, np.ndarray] = field(default_factory=dict)
 
@@ -101,9 +102,8 @@ class Search(TaskOptions):
             object.__setattr__(self, "method_seed", seed)
         known = None if self.start is None else known_designs(self.start, task)
         chosen = checked_method(self.method, task)
-        for name, value in (
-            ("method", chosen), ("objective", Objective(task)), ("_known", known)
-        ):  # fmt: skip
+        made = {"method": chosen, "objective": Objective(task), "_known": known}
+        for name, value in made.items():
             object.__setattr__(self, name, value)
         study = Study(self._about("auto", known), task.space.names, task.streams(None))
         if known is not None and known.entry is not None:
@@ -163,8 +163,7 @@ class Search(TaskOptions):
         terminal. Raises InputError for an argument that is not allowed, for the study of another
         search, and where no design was grown to full size.
         """
-        self._check_run(colonies, stop_at)
-        checks.integer("work_items", work_items, least=1)
+        self._check_run(colonies, stop_at, work_items)
         self._begin(colonies, study, wall_hours)
         try:
             with open_bar(colonies, progress) as bar:
@@ -174,10 +173,11 @@ class Search(TaskOptions):
                     task = self.objective.task
                     under_each = colonies / task.conditions
                     run = (task, self.study, under_each, executor, work_items)
-                    finals = FinalsRun(self.finals, *run)
+                    finals = FinalsRun(self.finals, *run, self._progress.deadline)
                 holds = self._search(colonies, stop_at, finals, bar, executor, work_items)
-                late = not holds and self._is_late
-                if finals is not None and not holds and not late and not all_failed(self.study):
+                wanted = finals is not None and not holds and not all_failed(self.study)
+                late = self._progress.late or (wanted and self._is_late)
+                if finals is not None and wanted and not late:
                     self._with_all_left(finals, colonies).run()
                 show(bar, self.study)
                 finish(bar)
@@ -206,13 +206,14 @@ class Search(TaskOptions):
         assert self._progress.chosen is not None
         return bool(getattr(self._progress.chosen.method, "over", False))
 
-    def _check_run(self, colonies: int, stop_at: float | None) -> None:
+    def _check_run(self, colonies: int, stop_at: float | None, work_items: int) -> None:
         task = self.objective.task
         least, count = task.colonies_each, task.conditions
         under = f" under each of {count} conditions" if count > 1 else ""
         takes = f"One design takes replicates={task.replicates} colonies{under}."
         hint = takes if least > 1 else ""
         checks.integer("colonies", colonies, least=least, hint=hint)
+        checks.integer("work_items", work_items, least=1)
         if stop_at is not None:
             checks.number("stop_at", stop_at)
             if task.goals:
@@ -238,14 +239,15 @@ class Search(TaskOptions):
         known = self._progress.known
         proposal = repeat_study(method, task, self.study, known)
         within_reach = check_within_reach(self.objective, self.study)
-        while not self._reached(stop_at, finals):
+        while not ((finals is None or not self._is_late) and self._reached(stop_at, finals)):
             if self._is_late:
+                self._progress.late = self._room(colonies, False) >= task.colonies_each
                 return False
             in_vain = self.study.searched >= max(IN_VAIN * colonies, LEAST_IN_VAIN)
             if proposal is None and (self._is_over or (in_vain and all_failed(self.study))):
                 return False
-            number = len(self.study.entries)
-            proposal = proposal or Proposal.of_number(number, method, task, known)
+            count = len(self.study.entries)
+            proposal = proposal or Proposal.of_number(count, method, task, known)
             part = proposal.part(self.objective, self._room(colonies, False))
             if part is None and finals is not None and self._may_be_certain and finals.sound():
                 part = proposal.part(self.objective, self._room(colonies, True))
@@ -380,21 +382,18 @@ class Search(TaskOptions):
         about = task.describe() | {"names": list(task.space.names), "method": method}
         if self.method_seed is not None:
             about["method seed"] = self.method_seed
-        if known is not None:
-            about["start"] = known.describe()
-        return about
+        return about | ({} if known is None else {"start": known.describe()})
 
     def _begin(self, colonies: int, path: str | Path | None, wall_hours: float | None) -> None:
         """Choose the method of a run, and open its study, which may resume."""
         task, progress = self.objective.task, self._progress
-        progress.deadline = math.inf
+        progress.deadline, progress.late = math.inf, False
         if wall_hours is not None:
             hours = checks.number("wall_hours", wall_hours, above=0.0)
             progress.deadline = time.monotonic() + 3600.0 * hours
         path = None if path is None else checks.file_path("study", path)
         resumed = Study.read(path) if path is not None and path.exists() else None
-        progress.chosen = self._choose(colonies, resumed)
-        known = self._known
+        progress.chosen, known = self._choose(colonies, resumed), self._known
         if known is not None and resumed is not None:
             known = known.begun(resumed)
         about = self._about(progress.chosen.describe(), known)

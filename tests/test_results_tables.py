@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import math
+import shutil
 
 import h5py
 import numpy as np
@@ -409,3 +410,12 @@ def test_a_table_of_all_frames_is_that_of_each(tmp_path, monkeypatch, most):
 def test_the_correlation_of_a_distribution_is_named_with_it():
     paths = ["Growth.rate.median", "Growth.rate.inherited"]
     assert list(column_names(paths, set()).values()) == ["rate.median", "rate.inherited"]
+
+
+@pytest.mark.parametrize("value", [2**63 - 1, -1, 10**6])
+def test_a_damaged_frame_is_named_in_a_table_of_all(whole, tmp_path, value):
+    path = shutil.copy(whole[0], tmp_path / "run.h5")
+    with h5py.File(path, "r+") as file:
+        file["frames/first_row"][3] = value
+    with tf.Results(path) as results, pytest.raises(tf.InputError, match=r"damaged: frame 3 has"):
+        results.table()

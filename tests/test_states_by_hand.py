@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 import weakref
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -11,6 +14,24 @@ import torch
 
 import torchfilm as tf
 from torchfilm.loop import advance
+
+
+@dataclass(frozen=True, eq=False)
+class Shrinking(tf.Effect):
+    """An effect of a user's may set what none of torchfilm's would."""
+
+    title, stage = "shrinking", 5.0
+
+    def reads(self):
+        return ("growth_rate", "gfp")
+
+    def writes(self):
+        return ("growth_rate", "gfp")
+
+    def step(self, state, dt, values):
+        less = torch.full_like(state.growth_rate, -0.2)
+        return state.with_fields(growth_rate=less, gfp=state.gfp - 1.0)
+
 
 BOX = {"box": ((-16.0, -16.0), (16.0, 16.0)), "spacing": 4.0}
 
@@ -69,6 +90,8 @@ def test_numbers_keep_their_gradient():
     [
         ("divide_flag", torch.ones(1), r"true or false, torch\.bool\. Convert it: value > 0"),
         ("growth_rate", torch.ones(1, dtype=torch.bool), r"numbers of torch\.float32"),
+        ("growth_rate", torch.ones(1, dtype=torch.complex64), r"numbers of torch\.float32"),
+        ("growth_rate", torch.tensor([1e300], dtype=torch.float64), r"1e\+300.*torch\.float32"),
         ("growth_rate", 2.0, r"torch\.full_like\(state\.growth_rate, …\)"),
         ("growth_rate", [2.0], r"torch\.as_tensor\(…, dtype=torch\.float32"),
         ("growth_rate", np.ones(1), r"torch\.as_tensor\(…, dtype=torch\.float32"),
@@ -105,6 +128,17 @@ def test_values_that_no_cell_can_have_are_refused_before_a_run(name, value, word
             begin(scene(), state, until=0.1)
 
 
+def test_what_effects_of_a_user_set_is_theirs(tmp_path):
+    """So that a run that they are in goes on from its file."""
+    made, path = scene().replace(Shrinking(), *scene().effects), tmp_path / "run.h5"
+    tf.simulate(made, until=0.2, record=tf.Recorder(path, made, every=1)).last()
+    with tf.Results(path) as results:
+        state = results.state(made)
+    assert float(state.growth_rate[0]) < 0
+    again = tf.Recorder(path, made, append=True)
+    assert tf.simulate(made, state, until=0.3, record=again).last().step == 6
+
+
 def test_levels_below_zero_are_those_of_explicit_methods():
     state = first(method="rk4").with_fields(gfp=torch.tensor([-1.0]))
     last = tf.simulate(scene(method="rk4"), state, until=1.0).last()
@@ -125,9 +159,17 @@ def test_cells_behind_a_wall_are_refused_where_a_run_goes_on():
 
 def test_a_signal_cannot_be_set_in_place():
     state = first()
-    with pytest.raises(tf.InputError, match=r"state\.with_fields\(\*\*\{'out\.food': …\}\)"):
-        state.signals["food"] = torch.zeros(64)
-    assert dict(state.signals)["food"] is state.fields["out.food"]
+    found, words = state.signals, r"state\.with_fields\(\*\*\{'out\.NAME': …\}\)"
+    with pytest.raises(tf.InputError, match=words):
+        found["food"] = torch.zeros(64)
+    with pytest.raises(tf.InputError, match=words):
+        found |= {"food": torch.zeros(64)}
+    for change in (found.update, found.setdefault, found.pop):
+        with pytest.raises(tf.InputError, match=words):
+            change("food")
+    assert dict(found)["food"] is state.fields["out.food"]
+    for same in (copy.copy(found), copy.deepcopy(found), pickle.loads(pickle.dumps(found))):
+        assert type(same) is type(found) and torch.equal(same["food"], found["food"])
 
 
 def test_a_state_after_a_failed_step_says_so():
@@ -138,24 +180,28 @@ def test_a_state_after_a_failed_step_says_so():
 
 
 def test_founders_and_values_are_copies():
-    """What a user does to an array later, changes no scene."""
+    """What a user does to an array later changes no scene."""
     length, rates = np.array([2.0, 2.0]), np.array([1.0, 2.0])
-    tensor, list_ = torch.tensor([1.0, 2.0]), [1.0, 2.0]
+    list_ = [1.0, 2.0]
     cells = tf.Cells([[0.0, 0.0], [5.0, 0.0]], [[1.0, 0.0]] * 2, length=length)
-    made = [tf.Growth(rate=given) for given in (rates, tensor, list_)]
+    made = [tf.Growth(rate=given) for given in (rates, list_)]
     model = tf.Scene(made[0], founders=cells, dim=2).bind(2)
-    for given in (length, rates, tensor, list_):
+    for given in (length, rates, list_):
         given[0] = 7.0
     assert model.start().length.tolist() == [2.0] * 4 and cells.length.tolist() == [2.0, 2.0]
     assert all(growth.rate.tolist() == [1.0, 2.0] for growth in made)
 
 
-def test_a_scene_follows_a_value_that_an_optimiser_changes():
-    rate = torch.tensor([1.0, 2.0], requires_grad=True)
-    growth = tf.Growth(rate=rate)
+def test_a_scene_follows_a_tensor_that_an_optimiser_changes():
+    """Also one that was frozen as the scene was made."""
+    rate = torch.nn.Parameter(torch.tensor([1.0, 2.0]), requires_grad=False)
+    made = tf.Scene(tf.Growth(rate=rate), dim=2, dt=0.1)
     with torch.no_grad():
         rate[0] = 3.0
-    assert growth.rate.tolist() == [3.0, 2.0]
+    rate.requires_grad_()
+    state = tf.rollout(made, made.bind(2).start(), until=0.1)
+    state.length.sum().backward()
+    assert made.effects[0].rate.tolist() == [3.0, 2.0] and bool((rate.grad > 0).all())
 
 
 def test_the_last_state_of_a_run_keeps_no_others():
@@ -164,6 +210,31 @@ def test_the_last_state_of_a_run_keeps_no_others():
     last = run.last()
     assert last.step == 10 and run.last() is last and kept[0]() is None
     assert tf.simulate(scene(), last, until=last.time).last() is last  # no step is left
+
+
+def test_a_run_that_failed_has_no_last_state():
+    run = tf.simulate(scene(), until=0.5)
+    state = next(run).with_fields(gfp=torch.tensor([math.nan]))
+    for act in (lambda: run.send(state), run.last, run.last):
+        with pytest.raises(tf.SimulationError, match="colony 0"):
+            act()
+
+
+def test_a_state_that_is_sent_takes_the_place_of_the_last():
+    """So that no large one is kept while the next step is computed."""
+    run = tf.simulate(scene(), until=0.5)
+    seen = weakref.ref(next(run))
+    kept = []
+
+    def look(state):
+        kept.append(seen())
+
+    watched = tf.simulate(scene(), until=0.5, observers=[look])
+    now = next(watched)
+    seen = weakref.ref(now)
+    now = now.replace(time=now.time)
+    watched.send(now)
+    assert kept[-1] is None
 
 
 def test_an_interrupt_within_a_compiled_function_is_an_interrupt():

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -361,8 +361,8 @@ class BoundEffect:
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         """Raise InputError if this effect cannot act together with the others (all traced)."""
 
-    def check_given(self, state: State) -> None:
-        """Raise InputError if this effect cannot go on with a state that was given."""
+    def check_given(self, state: State, free: Container[str]) -> None:
+        """Raise InputError if no run goes on with a state. free: fields that own effects set."""
 
     def warn_of_others(self) -> None:
         """Warn where this effect and the others, checked before, are probably not meant so."""

@@ -58,10 +58,13 @@ class States(Generator[State, State | None, None]):
 
     def __init__(self, states: Generator[State, State | None, None], first: State):
         self._states, self._begun, self._now = states, False, first
+        self._failed: Exception | None = None
 
     def last(self) -> State:
         """The state at the end of the run: the one from which it starts where no step is left. The
-        others are not kept."""
+        others are not kept. Raises what the run has ended with, if that was an error."""
+        if self._failed is not None:
+            raise self._failed
         for _ in self:
             pass
         return self._now
@@ -78,7 +81,12 @@ class States(Generator[State, State | None, None]):
                 " begin with yours, tf.simulate(scene, state)."
             )
         self._begun = True
-        self._now = self._states.send(value)
+        self._now = self._now if value is None else value
+        try:
+            self._now = self._states.send(value)
+        except Exception as error:
+            self._failed = None if isinstance(error, StopIteration) else error
+            raise
         return self._now
 
     def throw(self, *error: Any) -> State:

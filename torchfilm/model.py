@@ -22,7 +22,7 @@ import torch
 from torchfilm import binding_checks
 from torchfilm.arrivals import with_arrivals
 from torchfilm.cpu_parts import CpuTwins, OnCpu
-from torchfilm.effect import BUILT_IN, DIVISION, FLAGGED_DIVISION, Binding, BoundEffect
+from torchfilm.effect import BUILT_IN, DIVISION, FLAGGED_DIVISION, Binding, BoundEffect, is_own
 from torchfilm.founders import FirstCells
 from torchfilm.initial_cells import Cells
 from torchfilm.joined_step import JoinedStep, joined
@@ -216,6 +216,9 @@ class Model:
                 f"{path} has {tensor.numel()} values, but the batch has a colony number {highest}:"
                 " the state is not of this scene."
             )
+        own = [e for e in self.effects if is_own(e.effect)]
+        set_by = lambda e: state.fields if e.effect.writes_anything else e.writes()
+        free = {name for e in own for name in set_by(e)}
         for effect in self.effects:
             for name in (*effect.effect.needs(), *(f.name for f in effect.declares())):
                 if name not in state.fields and name not in BUILT_IN:
@@ -224,7 +227,7 @@ class Model:
                         " first values: scene.take_over(state). Or begin: scene.bind(…).start()."
                     )
             if values:
-                effect.check_given(state)
+                effect.check_given(state, free)
 
     def check_step(self, dt: float) -> None:
         """Raise InputError for a step that no effect can follow."""

@@ -129,8 +129,8 @@ def test_hours_end_a_run_which_a_study_resumes(tmp_path, capsys, monkeypatch):
     whole = ran(40, finals=Finals(share=0.4, most=2))
     path = tmp_path / "s.h5"
     made = search(finals=Finals(share=0.4, most=2))
-    clock = iter([0.0, 1800.0, 3599.0, 3600.0, 3600.0])
-    monkeypatch.setattr("design.search.time.monotonic", lambda: next(clock))
+    now = lambda: 3600.0 if len(made.study.entries) > 1 else 0.0
+    monkeypatch.setattr("time.monotonic", now)
     best = made.run(40, study=path, wall_hours=1.0, progress=False)
     assert len(made.study.entries) == 2 and not made.study.finals
     assert best.loss == min(e.loss.min() for e in made.study.entries)
@@ -142,6 +142,25 @@ def test_hours_end_a_run_which_a_study_resumes(tmp_path, capsys, monkeypatch):
     again = ran(40, path, finals=Finals(share=0.4, most=2))
     assert np.array_equal(points_of(again.study), points_of(whole.study))
     assert again.study.finals and again.best().loss == whole.best().loss
+
+
+def test_no_design_is_tested_for_its_loss_after_the_hours(tmp_path, capsys, monkeypatch):
+    made = search(finals=Finals(share=0.4, most=2))
+    now = lambda: 3600.0 if made.study.entries else 0.0
+    monkeypatch.setattr("time.monotonic", now)
+    made.run(40, stop_at=1e9, wall_hours=1.0, progress=False)
+    assert len(made.study.entries) == 1 and not made.study.finals
+    assert "stopped at 6 of 40 colonies after wall_hours=1; " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("colonies", "stop_at"), [(24, None), (25, None), (40, 1e9)])
+def test_a_search_that_is_done_as_its_hours_end_is_no_stopped_one(
+    colonies, stop_at, capsys, monkeypatch
+):
+    made = search()
+    monkeypatch.setattr("time.monotonic", lambda: 3600.0 * (made.study.colonies > 23))
+    made.run(colonies, stop_at=stop_at, wall_hours=1.0, progress=False)
+    assert "stopped" not in capsys.readouterr().err
 
 
 def test_hours_that_pass_before_the_first_batch(capsys):
@@ -156,3 +175,19 @@ def test_hours_that_pass_before_the_first_batch(capsys):
 def test_hours_are_positive(hours):
     with pytest.raises(tf.InputError, match="wall_hours"):
         search().run(8, wall_hours=hours, progress=False)
+
+
+def test_a_study_of_other_parameters_is_refused_by_what_differs(tmp_path):
+    ran(8, tmp_path / "old.h5")
+    ran(12, tmp_path / "new.h5", start=tmp_path / "old.h5")
+    more = [*MAKE, Parameter("decay", 0.5, 2.0)]
+    ran(4, tmp_path / "old.h5")
+    with pytest.raises(tf.InputError, match=r"is the study of another search\. Different: "):
+        ran(14, tmp_path / "new.h5", parameters=more, start=tmp_path / "old.h5")
+
+
+def test_a_remark_counts_what_is_grown_again(capsys):
+    one = ran(8, seed=3)
+    ran(12, start=[one.study, one.study])
+    said = capsys.readouterr().err
+    assert said.count("are grown again") == 1 and "so its 4 best designs are grown again" in said

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -241,8 +241,8 @@ class BoundCircuit(BoundEffect):
         dt /= together.medium.steps if together else self.plan.turns
         warn_of_means(circuit.value_owner(), circuit.parameters, dt)
 
-    def check_given(self, state: State) -> None:
-        check_levels(self.effect, state.fields)
+    def check_given(self, state: State, free: Container[str]) -> None:
+        check_levels(self.effect, state.fields, free)
 
     @property
     def why_turns(self) -> str:

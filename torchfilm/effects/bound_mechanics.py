@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -79,7 +79,7 @@ class BoundMechanics(BoundEffect):
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         self.drifts = any("drift" in effect.writes() for effect in effects)
 
-    def check_given(self, state: State) -> None:
+    def check_given(self, state: State, free: Container[str]) -> None:
         """Soft walls may have given way by more than a cell's radius."""
         hard = (s for s in self.effect.surfaces() if s.wall.stiffness is None)
         self.effect.check_behind(state, hard)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from weakref import ref
@@ -165,7 +165,7 @@ class BoundMedium(_MediumPart):
         for name in medium.signals:
             self.transport.check(name, state)
 
-    def check_given(self, state: State) -> None:
+    def check_given(self, state: State, free: Container[str]) -> None:
         if self.effect.method not in ("crank_nicolson", "euler"):  # these may go below 0
             check_signals(state.fields)
 

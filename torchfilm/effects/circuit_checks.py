@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Container, Iterable, Mapping, Sequence, Set
 from numbers import Integral
 from typing import Any
 
@@ -227,11 +227,12 @@ def warn_of_gradients(circuit: Any, networks: Iterable[Any], tracked: bool) -> N
         )
 
 
-def check_levels(circuit: Any, fields: Mapping[str, Tensor]) -> None:
-    """Raise InputError where a state that is given has a level below 0; by other methods one may
-    come there."""
+def check_levels(circuit: Any, fields: Mapping[str, Tensor], free: Container[str]) -> None:
+    """Raise InputError where a state that is given has a level below 0, which is not `free`; by
+    other methods one may come there."""
     for name in circuit.variables.values() if circuit.method in (STIFF, LEAP, DIRECT) else ():
-        check_field(fields, name, lambda x: x < 0, "at least 0")
+        if name not in free:
+            check_field(fields, name, lambda x: x < 0, "at least 0")
 
 
 def check_read(circuit: Any, read: set[str]) -> None:

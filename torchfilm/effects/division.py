@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -249,8 +249,10 @@ class _BoundDivision(BoundEffect):
         name = effect.criterion
         self.drawn = None if name is None else evenly_drawn(self.values[name])
 
-    def check_given(self, state: State) -> None:
-        check_field(state.fields, "division_threshold", torch.isnan, "a number, or inf: never")
+    def check_given(self, state: State, free: Container[str]) -> None:
+        name = "division_threshold"
+        if name not in free:
+            check_field(state.fields, name, torch.isnan, "a number, or inf: never")
 
     def step(self, state: State, dt: float) -> State:
         size = self.effect.size(state)

@@ -4,7 +4,7 @@ back."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -306,8 +306,9 @@ class _BoundGrowth(BoundEffect):
                 f" be multiplied by 60 ({60 * usual:g})."
             )
 
-    def check_given(self, state: State) -> None:
-        check_field(state.fields, "growth_rate", lambda x: x < 0, "at least 0 (1/h)")
+    def check_given(self, state: State, free: Container[str]) -> None:
+        if "growth_rate" not in free:
+            check_field(state.fields, "growth_rate", lambda x: x < 0, "at least 0 (1/h)")
 
     def warn_of_others(self) -> None:
         """Warn where a growth rate has no effect since an effect sets another one."""

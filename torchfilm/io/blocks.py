@@ -26,7 +26,8 @@ def spans(results: Results, frames: Sequence[int]) -> tuple[np.ndarray, np.ndarr
     first = read_dataset(results.file, "frames/first_row", slice(low, high))[own]
     counts = read_dataset(results.file, "frames/counts", slice(low, high))[own]
     sizes, rows = counts.sum(1), len(results.file["cells/uid"])
-    wrong = (counts < 0).any(1) | (first < 0) | (sizes < 0) | (first + sizes > rows)
+    wrong = (counts < 0).any(1) | (sizes < 0) | (sizes > rows) | (first < 0)
+    wrong |= first > rows - sizes  # a sum could exceed the range of numbers
     if wrong.any():
         k = int(np.flatnonzero(wrong)[0])
         raise InputError(f"{results.path} is damaged: frame {frames[k]} has {sizes[k]} cells.")

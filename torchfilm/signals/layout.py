@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
@@ -30,11 +30,17 @@ class UnknownSignal(checks.InputError, KeyError):
 class Signals(dict[str, Tensor]):
     """Values of signals by name."""
 
-    def __setitem__(self, name: str, value: object) -> NoReturn:
+    def _refuse(self, *_: object, **__: object) -> NoReturn:
         raise checks.InputError(
-            f"signals[{name!r}] cannot be set: a state stays as it is. Make another:"
-            f" state = state.with_fields(**{{'out.{name}': …}})."
+            "the signals of a state cannot be set: it stays as it is. Make another: state ="
+            " state.with_fields(**{'out.NAME': …})."
         )
+
+    __setitem__ = __delitem__ = __ior__ = _refuse
+    update = setdefault = pop = popitem = clear = _refuse
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (dict(self),)
 
     def __missing__(self, name: str) -> Tensor:
         raise UnknownSignal(

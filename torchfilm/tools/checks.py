@@ -267,7 +267,7 @@ def value(
         except (TypeError, ValueError, RuntimeError) as error:
             raise input_error(name, given, "a number, or numbers", hint) from error
     if hasattr(given, "__array__") and not isinstance(given, Tensor):
-        given = torch.as_tensor(given)
+        given = torch.as_tensor(given).clone()  # the caller may change its own
     if not isinstance(given, Tensor):
         return number(name, given, above=above, least=least, most=most, hint=hint)
     if torch._C._functorch.is_functorch_wrapped_tensor(given):
@@ -278,8 +278,6 @@ def value(
     ):
         rule = "one number, or a 1-D tensor with one number per colony"
         raise input_error(name, tuple(given.shape), rule)
-    # an optimiser changes what has a gradient in place, and the scene is to follow; nothing else
-    given = given if given.requires_grad else given.clone()
     given = given if given.is_floating_point() else given.double()
     detached = given.detach()
     good = torch.isfinite(detached) & (detached > above) & (detached >= least) & (detached <= most)
