@@ -15,7 +15,7 @@ from design.entries import Entry
 from design.known_studies import KnownStudy, joined, known_study, usual_value
 from design.parameters import Value
 from design.saved_design import read_design
-from design.study import Study
+from design.study import START_POINTS, Study
 from design.task import Task
 from torchfilm import checks
 
@@ -62,6 +62,10 @@ class KnownDesigns:
         word = tf.digest(np.concatenate(self.batches).tolist())[:12]
         return f"{', '.join(kept + grown)}, {word}"
 
+    def about(self) -> dict[str, Any]:
+        """What the study of a search keeps of them."""
+        return {"start": self.describe(), START_POINTS: self.points.tolist()}
+
     def begun(self, study: Study) -> KnownDesigns:
         """Those with which a study of the search began, where they are some of these: the files
         from which these come have grown since. Else these, which `Study.check` compares."""
@@ -81,15 +85,17 @@ class KnownDesigns:
 
 
 def _begun(study: Study) -> KnownDesigns | None:
-    """The designs with which a study began; None where it does not hold them all."""
+    """The designs with which a study began; None where one of an earlier version stopped within
+    them."""
     said = study.about.get("start")
     entries, entry, points = list(study.entries), None, np.empty((0, len(study.names)))
     if not isinstance(said, str) or not entries:
         return None
     if WITH_LOSSES in said:
         entry = entries.pop(0)
-    if GROWN in said and entries:
-        points = entries[0].points
+    if GROWN in said:
+        every = study.about.get(START_POINTS)
+        points = np.array(every) if every else entries[0].points if entries else points
     if entry is None and not len(points):
         return None
     found = KnownDesigns(points, entry)

@@ -382,7 +382,7 @@ class Search(TaskOptions):
         about = task.describe() | {"names": list(task.space.names), "method": method}
         if self.method_seed is not None:
             about["method seed"] = self.method_seed
-        return about | ({} if known is None else {"start": known.describe()})
+        return about | ({} if known is None else known.about())
 
     def _begin(self, colonies: int, path: str | Path | None, wall_hours: float | None) -> None:
         """Choose the method of a run, and open its study, which may resume."""

@@ -20,6 +20,9 @@ from design.study_file import StudyData, read_study, write_study
 from design.study_refusal import refusal
 from torchfilm import checks, displays
 
+# the designs that are grown first, by which a study goes on that stopped within them
+START_POINTS = "start points"
+
 
 @dataclass(eq=False, repr=False)
 class Study:
@@ -222,7 +225,8 @@ class Study:
 
     def check(self, about: Mapping[str, Any]) -> None:
         """Raises InputError where this is the study of another search than `about` tells of."""
-        differ = [n for n in {**about, **self.about} if about.get(n) != self.about.get(n)]
+        names = [n for n in {**about, **self.about} if n != START_POINTS]  # as "start" describes
+        differ = [n for n in names if about.get(n) != self.about.get(n)]
         if differ:
             assert self.path is not None
             raise tf.InputError(refusal(self.path, differ, self.about, about))

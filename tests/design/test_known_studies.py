@@ -88,6 +88,16 @@ def test_a_study_goes_on_after_its_start_has_grown(method, seed, tmp_path, capsy
     assert again.study.colonies == 34
 
 
+def test_a_study_that_stopped_within_its_start_goes_on(tmp_path):
+    ran(8, tmp_path / "old.h5", seed=3)
+    whole = ran(12, start=tmp_path / "old.h5")
+    ran(4, tmp_path / "new.h5", start=tmp_path / "old.h5")  # two of four designs
+    ran(16, tmp_path / "old.h5", seed=3)
+    made = ran(12, tmp_path / "new.h5", start=tmp_path / "old.h5")
+    assert np.array_equal(points_of(made.study), points_of(whole.study))
+    assert len(made.study.entries[0].points) == 4
+
+
 def test_a_study_does_not_go_on_with_other_values(tmp_path):
     """Values that are given by hand are meant, so that none is left out in silence."""
     ran(8, tmp_path / "old.h5")
