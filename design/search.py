@@ -239,8 +239,10 @@ class Search(TaskOptions):
         known = self._progress.known
         proposal = repeat_study(method, task, self.study, known)
         within_reach = check_within_reach(self.objective, self.study)
-        while not ((finals is None or not self._is_late) and self._reached(stop_at, finals)):
-            if self._is_late:
+        while True:
+            if not ((late := self._is_late) and finals) and self._reached(stop_at, finals):
+                return True
+            if late:
                 self._progress.late = self._room(colonies, False) >= task.colonies_each
                 return False
             in_vain = self.study.searched >= max(IN_VAIN * colonies, LEAST_IN_VAIN)
@@ -266,7 +268,6 @@ class Search(TaskOptions):
                 proposal.tell(method)
                 proposal = None
             show(bar, self.study)
-        return True
 
     def _reserved(self, colonies: int, certain: bool = False) -> float:
         """How many of the colonies are for the finals. certain: seeds make no difference."""

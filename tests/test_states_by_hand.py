@@ -218,6 +218,12 @@ def test_a_run_that_failed_has_no_last_state():
     for act in (lambda: run.send(state), run.last, run.last):
         with pytest.raises(tf.SimulationError, match="colony 0"):
             act()
+    stopped = tf.simulate(scene(), until=0.5)
+    next(stopped)
+    with pytest.raises(KeyboardInterrupt):
+        stopped.throw(KeyboardInterrupt())
+    with pytest.raises(tf.SimulationError, match="this run has ended early: KeyboardInterrupt"):
+        stopped.last()
 
 
 def test_a_state_that_is_sent_takes_the_place_of_the_last():

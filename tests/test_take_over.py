@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -95,6 +97,50 @@ def test_molecules_are_whole_where_they_are_counted(grown):
     assert (grown.gfp * grown.volume * 20.0 - amounts).abs().max() <= 1.0
 
 
+@pytest.mark.parametrize("outside", ["error", "grow", "reservoir"])
+def test_the_same_medium_and_counted_molecules_stay_to_the_bit(outside):
+    counted = tf.Circuit(
+        [tf.Reaction({}, {"gfp": 1}, 2.0), tf.Reaction({"gfp": 1}, {}, 1.0)], species="gfp",
+        method="tau_leap", molecules_per_unit=20.0,
+    )  # fmt: skip
+    box = {"box": ((-6.0, -6.0), (6.0, 6.0)), "spacing": 2.0}
+    medium = tf.Medium(food=tf.Signal(10.0, initial=1.0), outside=outside, **box)
+    made = scene(counted, medium)
+    for hours in (0.6, 1.2, 1.8):
+        state = tf.simulate(made, until=hours).last()
+        taken = made.take_over(state)
+        for name, value in state.fields.items():
+            assert torch.equal(taken.fields[name], value), name
+        assert taken.layout is state.layout
+
+
+def test_concentrations_are_those_of_the_cells_as_they_are(grown):
+    """Though no circuit has followed their volumes for a while."""
+    bare = scene()
+    later = tf.simulate(bare, grown, until=3.0).last()
+    idle = tf.Circuit(lambda u, s, p, cell: {}, species="rfp", initial={"rfp": 1.0})
+    slow = scene(idle)
+    step = tf.simulate(slow, slow.take_over(later), until=3.0 + DT).last()
+    # diluted by the growth of one step, not of half an hour
+    assert step.rfp.mean().item() == pytest.approx(math.exp(-DT), abs=0.02)
+
+
+def test_space_is_that_of_the_scene():
+    plain = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2), dt=DT)
+    periodic = plain.replace(*plain.effects[:2], tf.Mechanics(dim=2, periodic={"x": (-20.0, 20.0)}))
+    state = tf.simulate(plain, until=1.0).last()
+    assert periodic.take_over(state).space == periodic.bind().start().space is not None
+
+
+def test_names_that_rules_are_the_first_to_set(grown):
+    def marks(cells):
+        cells.long = cells.length > 1.0
+
+    made = scene(tf.Rules(marks))
+    taken = made.take_over(grown)
+    assert not taken.long.any() and tf.simulate(made, taken, until=2.6).last().long.all()
+
+
 def test_states_that_do_not_fit_are_refused(grown):
     with pytest.raises(tf.InputError, match=r"state = '2-D'.*3-D, as the scene is"):
         scene(dim=3).take_over(grown)
@@ -106,6 +152,16 @@ def test_states_that_do_not_fit_are_refused(grown):
     )
     with pytest.raises(tf.InputError, match="on another grid, of 4 × 4"):
         fine.take_over(there)
+    more = tf.Medium(food=tf.Signal(10.0), ahl=tf.Signal(20.0), **BOX)
+    with pytest.raises(tf.InputError, match=r"a medium of food.*that of the scene, of ahl, food"):
+        scene(more).take_over(there)
+    small = tf.Medium(food=tf.Signal(10.0), box=((-2.0, -2.0), (2.0, 2.0)), spacing=1.0)
+    with pytest.raises(tf.InputError, match=r"Medium\.box.*too small for colony 0"):
+        scene(small).take_over(grown)
+    founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], extra={"vigour": [0.5]})
+    slowed = tf.Scene(tf.Growth(rate=1.0, factor="vigour"), founders=founders, dt=DT)
+    with pytest.raises(tf.InputError, match=r"needs the field 'vigour'.*scene\.bind\(…\)\.start"):
+        slowed.take_over(grown)
     with pytest.raises(
         tf.InputError, match=r"rules needs the field 'age'.*scene\.take_over\(state\)"
     ):

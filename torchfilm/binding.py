@@ -9,6 +9,10 @@ import torch
 from torch import Tensor
 
 from torchfilm import binding_checks
+from torchfilm.effects.bound_circuit import BoundCircuit
+from torchfilm.effects.bound_rules import BoundRules
+from torchfilm.effects.circuit import Circuit
+from torchfilm.effects.medium import Medium
 from torchfilm.founders import FirstCells, checked_streams
 from torchfilm.initial_cells import Cells
 from torchfilm.model import Model
@@ -93,24 +97,58 @@ def _for_batch_of(scene: Scene, state: State, only: Collection[int] | None) -> M
 @one_torch_thread()
 def taken_over(scene: Scene, state: State) -> State:
     """See `Scene.take_over`."""
+    after_fork()
     model = _for_batch_of(scene, state, None)
     if state.dim != model.dim:
         raise checks.input_error("state", f"{state.dim}-D", f"{model.dim}-D, as the scene is")
     if state.span is not None:
         raise checks.InputError("take_over takes a state between two steps, not within one.")
-    made = state.replace(births=(), ended=(), reports={})
-    for effect in model.effects if state.layout is None else ():
-        made = effect.lay(made)
-    for field in model.first_fields.values():
-        if not _means_the_same(field, made.declared.get(field.name)):
-            others = {name: x for name, x in made.fields.items() if name != field.name}
-            made = made.replace(fields=others).declare(field)
-    if made.cells:  # names that rules are the first to set
-        model.trace(model.opened(made, 0.0))
+    media = [e for e in model.effects if isinstance(e.effect, Medium)]
+    signals = {n for e in scene.effects if isinstance(e, Medium) for n in e.signals}
+    if media and state.layout is not None and signals != state.signals.keys():
+        raise checks.input_error(
+            "take_over(state)", f"a state with a medium of {', '.join(sorted(state.signals))}",
+            f"one without a medium, or with that of the scene, of {', '.join(sorted(signals))}",
+            "Name all signals in the Medium of both scenes.",
+        )  # fmt: skip
+    made = state.replace(births=(), ended=(), reports={}, space=model.space)
+    new = set()
+    for medium in media if state.layout is None else ():
+        made = medium.lay(made)
+    for name, field in model.first_fields.items():
+        if not _means_the_same(field, made):
+            new.add(name)
+            made = _declared_anew(made, field)
+    for circuit in (e.effect for e in model.effects if isinstance(e.effect, Circuit)):
+        # no circuit may have kept them as cells grew
+        made = _declared_anew(made, model.first_fields[circuit.volume_field])
+    # names that rules are the first to set
+    model.trace(model.opened(made, 0.0) if made.cells else None)
+    own = lambda e: {f.name for f in e.declares()}
+    begun = media if state.layout is None else []
+    strange = [e for e in model.effects if e in begun or not new.isdisjoint(own(e))]
     for effect in model.effects:
-        made = effect.ready(made)
+        if effect in strange or isinstance(effect, BoundRules | BoundCircuit):
+            made = effect.ready(made)
     model.check(made)
+    for effect in strange:
+        effect.check(made)
     return made
+
+
+def _declared_anew(state: State, field: Field) -> State:
+    """A state in which a field has its first value, whatever it had."""
+    others = {name: x for name, x in state.fields.items() if name != field.name}
+    return state.replace(fields=others).declare(field)
+
+
+def _means_the_same(wanted: Field, state: State) -> bool:
+    """Whether a field of a state is what a scene means by it: a length at which cells divide is no
+    added length."""
+    about = lambda field: (field.meaning, field.unit, field.scope, field.shape)
+    there = state.declared.get(wanted.name)
+    alike = there is not None and about(wanted) == about(there)
+    return alike and state.fields[wanted.name].dtype == (wanted.dtype or state.dtype)
 
 
 def _count(
@@ -124,10 +162,3 @@ def _count(
 
 def _types(founders: Cells) -> tuple[int, ...]:
     return () if founders.cell_type is None else tuple(sorted({int(k) for k in founders.cell_type}))
-
-
-def _means_the_same(wanted: Field, there: Field | None) -> bool:
-    """Whether a field of a state is what a scene means by it: a length at which cells divide is no
-    added length."""
-    about = lambda field: (field.meaning, field.unit, field.scope, field.shape)
-    return there is not None and about(wanted) == about(there)

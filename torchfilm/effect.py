@@ -362,7 +362,7 @@ class BoundEffect:
         """Raise InputError if this effect cannot act together with the others (all traced)."""
 
     def check_given(self, state: State, free: Container[str]) -> None:
-        """Raise InputError if no run goes on with a state. free: fields that own effects set."""
+        """Raise InputError if no run goes on with a state. free: set by a user's effects."""
 
     def warn_of_others(self) -> None:
         """Warn where this effect and the others, checked before, are probably not meant so."""

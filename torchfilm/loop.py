@@ -58,13 +58,13 @@ class States(Generator[State, State | None, None]):
 
     def __init__(self, states: Generator[State, State | None, None], first: State):
         self._states, self._begun, self._now = states, False, first
-        self._failed: Exception | None = None
+        self._failed = ""  # by what it ended early
 
     def last(self) -> State:
         """The state at the end of the run: the one from which it starts where no step is left. The
-        others are not kept. Raises what the run has ended with, if that was an error."""
-        if self._failed is not None:
-            raise self._failed
+        others are not kept. Raises SimulationError for a run that an error has ended before."""
+        if self._failed:
+            raise SimulationError(f"this run has ended early: {self._failed}")
         for _ in self:
             pass
         return self._now
@@ -80,18 +80,22 @@ class States(Generator[State, State | None, None]):
                 "send(state) before the first state of the run: take that first, by next(run), or"
                 " begin with yours, tf.simulate(scene, state)."
             )
-        self._begun = True
         self._now = self._now if value is None else value
-        try:
-            self._now = self._states.send(value)
-        except Exception as error:
-            self._failed = None if isinstance(error, StopIteration) else error
-            raise
-        return self._now
+        return self._taken(self._states.send, value)
 
     def throw(self, *error: Any) -> State:
+        return self._taken(self._states.throw, *error)
+
+    def _taken(self, take: Callable[..., State], *given: Any) -> State:
         self._begun = True
-        return self._states.throw(*error)
+        try:
+            self._now = take(*given)
+        except (StopIteration, GeneratorExit):
+            raise
+        except BaseException as error:  # an interrupt, too
+            self._failed = f"{type(error).__name__}: {error}"
+            raise
+        return self._now
 
     def close(self) -> None:
         self._begun = True

@@ -70,7 +70,7 @@ class Model:
                     bound.append(part)
         self.effects: tuple[BoundEffect, ...] = tuple(sorted(bound, key=lambda e: e.stage))
         self._said: set[str] = set()  # what steps have warned of
-        self._space = scene.space
+        self.space = scene.space
         self.twins: CpuTwins | None = None  # of its effects, on a GPU
 
     # --- running -------------------------------------------------------------------------
@@ -119,7 +119,7 @@ class Model:
         it."""
         binding_checks.check_fits(state, self, self.first_fields)
         declared = {**state.declared, **self.first_fields}
-        new = {"declared": declared, "space": self._space, "span": (state.time, state.time + dt)}
+        new = {"declared": declared, "space": self.space, "span": (state.time, state.time + dt)}
         # what came since the last step, the next one is told of
         come = tuple(x for x in state.arrived if x.step == state.step)
         state = state.replace(births=(), ended=(), arrived=come, reports={}, **new)
@@ -154,7 +154,7 @@ class Model:
 
     def _laid(self, start: FirstCells) -> State:
         state = start.cells.state(start.colonies, start.seed, self.batch.device, self.batch.dtype)
-        state = state.replace(space=self._space)
+        state = state.replace(space=self.space)
         if start.streams is not None:
             state = state.replace(stream=start.streams.to(self.batch.device))
         for effect in self.effects:
@@ -222,9 +222,11 @@ class Model:
         for effect in self.effects:
             for name in (*effect.effect.needs(), *(f.name for f in effect.declares())):
                 if name not in state.fields and name not in BUILT_IN:
+                    hint = "Make the state with this scene: scene.bind(…).start()."
+                    if name in self.first_fields:
+                        hint = "Give it first values: scene.take_over(state)."
                     raise checks.InputError(
-                        f"{effect.title} needs the field {name!r}, which this state lacks. Give it"
-                        " first values: scene.take_over(state). Or begin: scene.bind(…).start()."
+                        f"{effect.title} needs the field {name!r}, which this state lacks. {hint}"
                     )
             if values:
                 effect.check_given(state, free)

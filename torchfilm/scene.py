@@ -197,9 +197,10 @@ class Scene(metaclass=checks.KnownKeywords):
     def take_over(self, state: State) -> State:
         """A state of another scene, with which this one goes on: `tf.simulate(scene,
         scene.take_over(state), until=…)`. Fields that it lacks, or that mean something else there,
-        have first values, as founders have; it gets this scene's medium where it has none. All
-        else stays, also fields that only the other scene has. Raises InputError where the two do
-        not fit, as with another dimension or grid."""
+        have first values; it gets this scene's medium where it has none. All else stays, also
+        fields that only the other scene has. Raises InputError where the two do not fit, as with
+        another dimension, other signals or another grid, and where a cell may not be where it
+        is."""
         return taken_over(self, state)
 
     @property

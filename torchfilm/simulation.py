@@ -128,7 +128,7 @@ def _attached(
 def _check_overwrite(recorder: Recorder, ended: bool) -> None:
     """Raise InputError where a run without a step would put one frame in the place of a file, as
     where a cell of a notebook is run again."""
-    if ended and recorder.overwrite and recorder.path.exists():
+    if ended and getattr(recorder, "overwrite", False) and recorder.path.exists():
         rule = "of a run with a step: the state from which it starts is at its end"
         hint = "Nothing would be recorded but that state. Give a later until, or an earlier state."
         raise checks.input_error("Recorder(…, overwrite=True)", str(recorder.path), rule, hint)

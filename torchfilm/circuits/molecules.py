@@ -20,6 +20,14 @@ def nearest(amount: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     return near, (amount - near).abs() > ROUNDED * eps * amount.abs().clamp(min=1.0)
 
 
+def whole_concentration(value: Tensor, size: Tensor, uniform: Callable[[], Tensor]) -> Tensor:
+    """A concentration that is a whole number of molecules, `size` of which are in its unit: the
+    same where it is one but for rounding, else `whole`."""
+    amount = value * size
+    _, off = nearest(amount, value.dtype)
+    return torch.where(off, whole(amount, uniform) / size, value)
+
+
 def whole(
     amount: Tensor, uniform: Callable[[], Tensor], dtype: torch.dtype | None = None
 ) -> Tensor:

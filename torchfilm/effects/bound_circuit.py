@@ -19,7 +19,7 @@ from torchfilm.circuits.compiled_step import Surroundings
 from torchfilm.circuits.compiled_stiff import compiled_stiff
 from torchfilm.circuits.dilution import Start, half_way, part_way
 from torchfilm.circuits.draws import KeyedDraws
-from torchfilm.circuits.molecules import whole
+from torchfilm.circuits.molecules import whole_concentration
 from torchfilm.circuits.names import label_of
 from torchfilm.circuits.network import build_network
 from torchfilm.circuits.tracing import Untraceable
@@ -208,7 +208,7 @@ class BoundCircuit(BoundEffect):
         size = state.volume * self.values.molecules_per_unit.of_cells(state)
         draw = lambda name: state.uniform(rows, f"first {name}")
         found = {
-            n: whole(state.fields[n] * size, partial(draw, n)) / size
+            n: whole_concentration(state.fields[n], size, partial(draw, n))
             for n in self.effect.own_fields
         }
         return state.with_fields(**found)
