@@ -55,21 +55,21 @@ def first(dtype=torch.float32, **circuit) -> tf.State:
     return scene(**circuit).bind(dtype=dtype).start()
 
 
-@pytest.mark.parametrize("given", [torch.float64, torch.int64, torch.float16], ids=str)
+@pytest.mark.parametrize("given", [torch.int64, torch.int32, torch.uint8], ids=str)
 @pytest.mark.parametrize("own", [torch.float32, torch.float64], ids=str)
-def test_numbers_become_those_of_the_field(own, given):
+def test_whole_numbers_become_those_of_the_field(own, given):
     state = first(own)
     made = state.with_fields(growth_rate=torch.tensor([2], dtype=given))
     assert made.growth_rate.dtype == own and float(made.growth_rate) == 2.0
 
 
-def test_a_column_of_numbers_is_recorded_and_resumed_as_it_is(tmp_path):
-    """A column of whole numbers had made a dataset of these, which cut off later fractions."""
+def test_a_column_of_whole_numbers_is_recorded_and_resumed_as_it_is(tmp_path):
+    """It had made a dataset of these, which cut off later fractions."""
     made, path = scene(), tmp_path / "run.h5"
     state = first().with_fields(growth_rate=torch.tensor([1]))
     run = tf.simulate(made, state, until=0.5, record=tf.Recorder(path, made, every=1))
     now = next(run)
-    now = run.send(now.with_fields(growth_rate=torch.tensor([1.7], dtype=torch.float64)))
+    now = run.send(now.with_fields(growth_rate=torch.tensor([1.7])))
     last = run.last()
     with tf.Results(path) as results:
         again = results.state(made)
@@ -77,6 +77,20 @@ def test_a_column_of_numbers_is_recorded_and_resumed_as_it_is(tmp_path):
     for name, value in last.fields.items():
         assert torch.equal(again.fields[name], value), name
     assert torch.equal(again.length, last.length)
+
+
+def test_a_column_that_a_file_would_round_is_refused(tmp_path):
+    """Or the run could not be resumed as it was."""
+    made = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), dim=2, dt=0.05)
+    path = tmp_path / "run.h5"
+    run = tf.simulate(made, until=0.5, record=tf.Recorder(path, made, every=1))
+    rate = torch.tensor([1.7], dtype=torch.float64)
+    state = next(run).with_fields(growth_rate=rate)
+    words = r"'growth_rate' is of float64 now, and of float32 in the file.*torch\.float32"
+    with pytest.raises(tf.SimulationError, match=words):
+        run.send(state)
+    with tf.Results(path) as results:
+        assert len(results) == 2  # what came before stays
 
 
 def test_numbers_keep_their_gradient():
@@ -91,7 +105,6 @@ def test_numbers_keep_their_gradient():
         ("divide_flag", torch.ones(1), r"true or false, torch\.bool\. Convert it: value > 0"),
         ("growth_rate", torch.ones(1, dtype=torch.bool), r"numbers of torch\.float32"),
         ("growth_rate", torch.ones(1, dtype=torch.complex64), r"numbers of torch\.float32"),
-        ("growth_rate", torch.tensor([1e300], dtype=torch.float64), r"1e\+300.*torch\.float32"),
         ("growth_rate", 2.0, r"torch\.full_like\(state\.growth_rate, …\)"),
         ("growth_rate", [2.0], r"torch\.as_tensor\(…, dtype=torch\.float32"),
         ("growth_rate", np.ones(1), r"torch\.as_tensor\(…, dtype=torch\.float32"),

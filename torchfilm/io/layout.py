@@ -31,7 +31,8 @@ which a frame adds a few rows, are not compressed: their chunks are written agai
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -39,6 +40,7 @@ import numpy as np
 from torch import Tensor
 
 from torchfilm.state import CELL, COLONY, PER_CELL, State
+from torchfilm.tools.checks import SimulationError
 
 FORMAT, VERSION = "torchfilm results", 3
 AT_CELLS = "signals_at_cells"
@@ -165,6 +167,24 @@ def write_rows(table: h5py.Dataset, at: int, value: np.ndarray) -> None:
         place = table.id.get_space()
         place.select_hyperslab((at,) + (0,) * (value.ndim - 1), value.shape)
         table.id.write(h5py.h5s.create_simple(value.shape), place, value)
+
+
+def check_columns(
+    path: Path, columns: Mapping[str, np.ndarray], tables: Mapping[str, h5py.Dataset | None]
+) -> None:
+    """Raise SimulationError for a column of cells that a file does not have, would round, or would
+    cut off."""
+    for name, value in columns.items():
+        if (table := tables[name]) is None:
+            raise SimulationError(
+                f"the field {name!r} appeared during the run, after {path} was laid out: give it a"
+                " first value in Rules(…, variables=…) and start the run again."
+            )
+        if value.dtype != table.dtype:
+            raise SimulationError(
+                f"the field {name!r} is of {value.dtype} now, and of {table.dtype} in {path}:"
+                f" convert what you set it to, value.to(torch.{table.dtype})."
+            )
 
 
 def next_chunk(table: h5py.Dataset, rows: int) -> int:

@@ -22,6 +22,7 @@ from torchfilm.io.layout import (
     LINEAGE,
     VERSION,
     cell_columns,
+    check_columns,
     colony_columns,
     create_framed,
     create_tables,
@@ -395,12 +396,7 @@ class Recorder(metaclass=checks.KnownKeywords):
 
     def _write_frame(self, file: h5py.File, state: State) -> None:
         columns = cell_columns(state)
-        unknown = [n for n in columns if self._table(f"cells/{n}") is None]
-        if unknown:
-            raise SimulationError(
-                f"the field {unknown[0]!r} appeared during the run, after {self.path} was laid out:"
-                " give it a first value in Rules(…, variables=…) and start the run again."
-            )
+        check_columns(self.path, columns, {n: self._table(f"cells/{n}") for n in columns})
         sizes = dict(self.sizes or committed(file))
         frame, first_voxel, voxels = sizes["frames"], 0, 0
         first_row = next_chunk(self._table("cells/uid"), sizes["rows"])

@@ -174,20 +174,18 @@ def checked_tensors(
 
 
 def _of_kind(name: str, value: Tensor, dtype: torch.dtype) -> Tensor:
-    """The values of a field as numbers of another kind: floats as other floats, whole numbers as
-    any. Raises InputError where that loses a fraction, or reads a number as a truth, and for what
-    is too large for a float."""
+    """The values of a field: whole numbers as floats where these are wanted; floats of another
+    precision stay, for exact derivatives. Raises InputError where a fraction would be lost, or a
+    number be read as a truth."""
+    if dtype.is_floating_point and value.is_floating_point():
+        return value
     truth, whole = dtype == torch.bool, not dtype.is_floating_point
     fraction = value.is_floating_point() or value.is_complex()
     if (whole and fraction) or value.is_complex() or truth != (value.dtype == torch.bool):
         wanted = "true or false, torch.bool" if truth else f"numbers of {dtype}"
         hint = "Convert it: value > 0." if truth else f"Convert it: value.to({dtype})."
         raise checks.input_error(f"type of the field {name!r}", value.dtype, wanted, hint)
-    found = value.to(dtype)
-    if bool((torch.isinf(found) & torch.isfinite(value)).any()):
-        shown = f"{float(value.detach().abs().max()):g}"
-        raise checks.input_error(f"the field {name!r}", shown, f"a number of {dtype}")
-    return found
+    return value.to(dtype)
 
 
 def check_fields(
