@@ -337,6 +337,9 @@ class Recorder(metaclass=checks.KnownKeywords):
         self._check_free_bytes(state)
         try:
             self._write_frame(self.file, state)
+        except SimulationError:
+            self.last = None
+            raise
         except (OSError, RuntimeError, MemoryError) as error:  # a failed flush is a RuntimeError
             self.last = None  # nothing more is written: the file ends with the last complete frame
             raise SimulationError(
