@@ -211,7 +211,8 @@ def test_a_state_on_another_grid_is_not_continued_silently():
     [
         (torch.ones(10), r"shape of the field 'out.food' = \(10,\).*\(400,\)"),
         (torch.ones(20, 20), r"shape of the field 'out.food' = \(20, 20\)"),
-        (torch.ones(400, dtype=torch.bool), "type of the field 'out.food'"),
+        (torch.ones(400, dtype=torch.int64), "type of the field 'out.food'"),
+        (torch.ones(400, dtype=torch.float64), "type of the field 'out.food'"),
         (torch.full((400,), -1.0), "'out.food', a signal.*0 or more everywhere"),
         (torch.full((400,), torch.nan), "'out.food', a signal.*0 or more everywhere"),
     ],

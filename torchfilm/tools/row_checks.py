@@ -168,6 +168,11 @@ def checked_tensors(
             hint = hint if len(wanted) == value.dim() == 1 else ""
             shown = tuple(value.shape)
             raise checks.input_error(f"shape of the field {name!r}", shown, rule, hint)
+        if name.startswith("out.") and value.dtype != now.dtype:
+            hint = f"Convert it: value.to({now.dtype})."
+            raise checks.input_error(
+                f"type of the field {name!r}", value.dtype, f"{now.dtype}, as the signals are", hint
+            )
         if value.dtype != now.dtype:
             found = {**found, name: _of_kind(name, value, now.dtype)}
     return found
