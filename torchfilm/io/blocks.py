@@ -34,7 +34,7 @@ def spans(results: Results, frames: Sequence[int]) -> tuple[np.ndarray, np.ndarr
     return first, sizes
 
 
-def blocks(results: Results, frames: Sequence[int]) -> Iterator[list[int]]:
+def blocks(results: Results, frames: Sequence[int]) -> Iterator[Block]:
     """The frames in parts, in order: of each the rows lie near each other, and the parameters of
     colonies are the same."""
     if not len(frames):
@@ -42,23 +42,24 @@ def blocks(results: Results, frames: Sequence[int]) -> Iterator[list[int]]:
     first, sizes = spans(results, frames)
     steps = results.steps
     stretch = np.searchsorted(last_steps(results.file), [steps[k] for k in frames])
-    part, low, high = [frames[0]], first[0], first[0] + sizes[0]
+    begin, low, high = 0, first[0], first[0] + sizes[0]
+    part = lambda end: Block(results, frames[begin:end], first[begin:end], sizes[begin:end])
     for k in range(1, len(frames)):
         low, high = min(low, first[k]), max(high, first[k] + sizes[k])
         if high - low > MOST_ROWS or stretch[k] != stretch[k - 1]:
-            yield part
-            part, low, high = [], first[k], first[k] + sizes[k]
-        part.append(frames[k])
-    yield part
+            yield part(k)
+            begin, low, high = k, first[k], first[k] + sizes[k]
+    yield part(len(frames))
 
 
 class Block:
     """The cells of some frames, one after the other. frames (K,); which (N,): of them each cell is
-    in."""
+    in. first, sizes: the `spans` of the frames."""
 
-    def __init__(self, results: Results, frames: Sequence[int]):
+    def __init__(
+        self, results: Results, frames: Sequence[int], first: np.ndarray, sizes: np.ndarray
+    ):
         self.results, self.frames = results, np.asarray(frames)
-        first, sizes = spans(results, frames)
         self.which = np.repeat(np.arange(len(frames)), sizes)
         within = np.arange(len(self.which)) - np.repeat(sizes.cumsum() - sizes, sizes)
         self._low, self._high = int(first.min()), int((first + sizes).max())

@@ -54,12 +54,12 @@ class Tables:
 
     def __call__(self, frames: Sequence[int], keep: Keep | None = None) -> dict[str, np.ndarray]:
         """The columns of some frames, in order, for all cells or for those to `keep`."""
-        parts = [self._block(some, keep) for some in blocks(self.results, frames)]
+        parts = [self._columns(block, keep) for block in blocks(self.results, frames)]
         return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
 
-    def _block(self, frames: Sequence[int], keep: Keep | None) -> dict[str, np.ndarray]:
+    def _columns(self, block: Block, keep: Keep | None) -> dict[str, np.ndarray]:
         """The columns of frames in which the parameters of colonies are the same."""
-        results, block = self.results, Block(self.results, frames)
+        results = self.results
         found, signals, which = block.cells(), block.signals(), block.which
         of_colonies = block.colony_fields(found["colony"])
         if keep is not None:
@@ -81,7 +81,7 @@ class Tables:
         fields = found | of_colonies
         hidden = set() if self.internals else results.internal_fields
         columns |= _of_fields({n: x for n, x in fields.items() if n not in hidden}, signals)
-        values = results.parameters(frames[0])
+        values = results.parameters(block.frames[0])
         for path, name in column_names(list(values), set(columns)).items():
             columns[name] = values[path][place]
         return columns

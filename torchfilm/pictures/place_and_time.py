@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torchfilm.io.blocks import Block, blocks
+from torchfilm.io.blocks import blocks
 from torchfilm.io.identity import declared_fields
 from torchfilm.io.results import Results
 from torchfilm.physics import capsule
@@ -114,13 +114,12 @@ def known_quantities(results: Results, *wanted: str) -> Iterator[tuple[Columns, 
     """The cells of each frame, and what it tells of each cell, (N,) by name, signals at them under
     "out.NAME". Raises InputError for a wanted name that the file does not tell."""
     hidden = results.internal_fields
-    for part in blocks(results, range(len(results))):
-        block = Block(results, part)
+    for block in blocks(results, range(len(results))):
         cells, signals = block.cells(), block.signals()
         known = {n: x for n, x in cells.items() if x.ndim == 1 and n not in hidden}
         known |= {OUTSIDE + n: x for n, x in signals.items()}
         _check_known(known, signals, wanted)
-        ends = np.searchsorted(block.which, np.arange(len(part) + 1))
+        ends = np.searchsorted(block.which, np.arange(len(block.frames) + 1))
         for first, end in itertools.pairwise(ends):
             rows = slice(first, end)
             yield {n: x[rows] for n, x in cells.items()}, {n: x[rows] for n, x in known.items()}
