@@ -94,8 +94,9 @@ def _begun(study: Study) -> KnownDesigns | None:
     if WITH_LOSSES in said:
         entry = entries.pop(0)
     if GROWN in said:
-        every = study.about.get(START_POINTS)
-        points = np.array(every) if every else entries[0].points if entries else points
+        kept = study.about.get(START_POINTS)  # studies of an earlier version have none
+        points = np.array(kept) if kept else points
+        points = entries[0].points if entries and not kept else points
     if entry is None and not len(points):
         return None
     found = KnownDesigns(points, entry)

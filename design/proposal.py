@@ -82,11 +82,11 @@ class Proposal:
         """Let a method learn the whole batch. Methods that never ask for slopes or residuals need
         not take any."""
         assert self.entry is not None
-        # copies: a method may write into the arrays that it gets, and the study must not change
-        found = copy.deepcopy(self.entry.target_losses)
         if self.known is not None:
             self._tell_known(method, self.known)
             return
+        # copies: a method may write into the arrays that it gets, and the study must not change
+        found = copy.deepcopy(self.entry.target_losses)
         batch = replace(self.batch, points=self.entry.points)
         slopes = (copy.deepcopy(self.entry.slopes),) if batch.slopes else ()
         more = {"residuals": copy.deepcopy(self.entry.residuals)} if batch.residuals else {}

@@ -29,7 +29,7 @@ from design.remarks import (
     remark_on_begin,
     remark_on_end,
     remark_on_stop,
-)  # fmt: skip
+)
 from design.study import Study
 from design.task import Task, TaskOptions
 from design.trivial import check_within_reach
@@ -105,9 +105,9 @@ class Search(TaskOptions):
         made = {"method": chosen, "objective": Objective(task), "_known": known}
         for name, value in made.items():
             object.__setattr__(self, name, value)
-        study = Study(self._about("auto", known), task.space.names, task.streams(None))
-        if known is not None and known.entry is not None:
-            study.entries.append(known.entry)
+        entry = None if known is None else known.entry
+        parts = task.space.names, task.streams(None), entry
+        study = Study.new(None, self._about("auto", known), *parts)
         object.__setattr__(self, "_progress", SearchProgress(study, task.tried.why_regrown))
 
     def __repr__(self) -> str:
@@ -400,10 +400,9 @@ class Search(TaskOptions):
         about = self._about(progress.chosen.describe(), known)
         if resumed is not None:
             resumed.check(about)
-        progress.known = known
-        progress.study = resumed or Study.new(path, about, task.space.names, task.streams(None))
-        if known is not None and known.entry is not None and not progress.study.entries:
-            progress.study.entries.append(known.entry)
+        entry = None if known is None else known.entry
+        parts = task.space.names, task.streams(None), entry
+        progress.known, progress.study = known, resumed or Study.new(path, about, *parts)
         if known is not None and known.remark:
             print(known.remark, file=sys.stderr)
         remark_on_begin(task)

@@ -213,15 +213,16 @@ class Study:
 
     @classmethod
     def new(
-        cls, path: Path | None, about: dict[str, Any], names: Sequence[str], streams: Sequence[int]
-    ) -> Study:
-        """A study without evaluations, which will be kept at a path, if one is given. Raises
-        InputError where there is no such folder."""
+        cls, path: Path | None, about: dict[str, Any], names: Sequence[str],
+        streams: Sequence[int], known: Entry | None = None,
+    ) -> Study:  # fmt: skip
+        """A study without evaluations but those that are known, which will be kept at a path, if
+        one is given. Raises InputError where there is no such folder."""
         if path is not None and not path.parent.is_dir():
             raise checks.input_error(
                 "study", str(path), "in a folder that exists", f"Make {path.parent} first."
             )
-        return cls(about, tuple(names), tuple(streams), path)
+        return cls(about, tuple(names), tuple(streams), path, [] if known is None else [known])
 
     def check(self, about: Mapping[str, Any]) -> None:
         """Raises InputError where this is the study of another search than `about` tells of."""

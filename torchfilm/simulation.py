@@ -232,9 +232,9 @@ def rollout(
     the step of an optimiser. On the CPU, and where torch is deterministic, steps that do not repeat
     then are an error.
 
-    scene: or a model, or a `Replay`, whose steps are as long as its recording's.
-    state: from which to start; by default the first. dt: h, by default the scene's. Failures are
-    raised as in `simulate`.
+    scene: or a model, or a `Replay`, whose steps are as long as its recording's. state: from which
+    to start; by default the first. dt: h, by default the scene's. Failures are raised as in
+    `simulate`.
     """
     _check_kinds("rollout", scene, state, Replay)
     dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
