@@ -248,8 +248,8 @@ class State:
         return made
 
     def with_fields(self, **values: Tensor) -> State:
-        """A state with some of its fields replaced; each must have been declared. Whole numbers
-        become floats where the field has these."""
+        """A state with some of its fields replaced; each must have been declared, and keeps its
+        type: whole numbers become floats, and float64 becomes float32 where the field is that."""
         if unknown := sorted(values.keys() - self.declared.keys()):
             own = [name for name, field in self.declared.items() if not field.internal]
             rule = f"declared: {', '.join(own) or 'none'}; parts have replace(position=…)"

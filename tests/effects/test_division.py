@@ -430,11 +430,14 @@ def test_a_division_of_ones_own_decides_for_itself(kind):
 
 @pytest.mark.parametrize("other", [torch.float32, torch.float64])
 def test_thresholds_of_another_type_than_lengths_stay_numbers(other, dtype):
-    """An effect of the user's may write them so; draws for daughters are of the column's type."""
+    """An effect of the user's may write them so, past with_fields; draws for daughters are of the
+    column's type."""
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.0, 3.2)))
     state = scene.bind(dtype=dtype).start()
-    state = state.with_fields(division_threshold=torch.full((1,), 3.1, dtype=other)).replace(
-        length=torch.full((1,), 3.5, dtype=dtype)
+    threshold = torch.full((1,), 3.1, dtype=other)
+    state = state.replace(
+        length=torch.full((1,), 3.5, dtype=dtype),
+        fields={**state.fields, "division_threshold": threshold},
     )
     bound = next(e for e in scene.bind(dtype=dtype).effects if e.title == "division")
     if other == dtype:

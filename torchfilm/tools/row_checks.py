@@ -179,11 +179,8 @@ def checked_tensors(
 
 
 def _of_kind(name: str, value: Tensor, dtype: torch.dtype) -> Tensor:
-    """The values of a field: whole numbers as floats where these are wanted; floats of another
-    precision stay, for exact derivatives. Raises InputError where a fraction would be lost, or a
-    number be read as a truth."""
-    if dtype.is_floating_point and value.is_floating_point():
-        return value
+    """The values of a field, as numbers of its type. Raises InputError where a fraction would be
+    lost, or a number be read as a truth."""
     truth, whole = dtype == torch.bool, not dtype.is_floating_point
     fraction = value.is_floating_point() or value.is_complex()
     if (whole and fraction) or value.is_complex() or truth != (value.dtype == torch.bool):
