@@ -85,6 +85,27 @@ def test_a_threshold_of_another_kind_has_first_values(grown):
     assert last.cells > grown.cells
 
 
+@pytest.mark.parametrize("kinds", [("length", "volume"), ("added", "length"), ("volume", "length")])
+def test_a_threshold_of_another_kind_is_refused_without(kinds):
+    """It had been compared with what it is no threshold of."""
+    first, other = (tf.Scene(tf.Growth(rate=1.0), tf.Division(**{k: 5.0}), dt=0.1) for k in kinds)
+    state = tf.simulate(first, until=0.5).last()
+    words = rf"'division_threshold' of this state means {kinds[0]}.*division.*means {kinds[1]}"
+    for go_on in (lambda: other.bind(state=state), lambda: tf.simulate(other, state, until=1.0)):
+        with pytest.raises(tf.InputError, match=words + r".*: scene\.take_over\(state\)"):
+            go_on()
+    assert tf.simulate(first, state, until=1.0).last().time == pytest.approx(1.0)
+    assert tf.simulate(other, other.take_over(state), until=1.0).last().time == pytest.approx(1.0)
+
+
+def test_columns_of_the_first_cells_may_have_the_name_of_a_field():
+    cells = tf.Cells.single(2, length=2.0)
+    cells = tf.Cells(cells.position, cells.axis, length=2.0, extra={"division_threshold": [2.5]})
+    made = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), founders=cells, dt=0.1)
+    state = tf.simulate(made, until=0.3).last()
+    assert tf.simulate(made, state, until=0.6).last().cells > 1
+
+
 def test_molecules_are_whole_where_they_are_counted(grown):
     counted = scene(
         tf.Circuit(

@@ -24,7 +24,7 @@ from torchfilm.arrivals import with_arrivals
 from torchfilm.cpu_parts import CpuTwins, OnCpu
 from torchfilm.effect import BUILT_IN, DIVISION, FLAGGED_DIVISION, Binding, BoundEffect, is_own
 from torchfilm.founders import FirstCells
-from torchfilm.initial_cells import Cells
+from torchfilm.initial_cells import GIVEN, Cells
 from torchfilm.joined_step import JoinedStep, joined
 from torchfilm.resolver import BoundBatch
 from torchfilm.state import CELL, PER_CELL, Field, State
@@ -220,6 +220,8 @@ class Model:
         set_by = lambda e: state.fields if e.effect.writes_anything else e.writes()
         free = {name for e in own for name in set_by(e)}
         for effect in self.effects:
+            if not is_own(effect.effect):
+                _check_meanings(effect, state)
             for name in (*effect.effect.needs(), *(f.name for f in effect.declares())):
                 if name not in state.fields and name not in BUILT_IN:
                     hint = "Make the state with this scene: scene.bind(…).start()."
@@ -353,6 +355,21 @@ def advanced(state: State, dt: float) -> State:
     state.check_fields()
     time = later(state.time, state.step, dt)
     return state.replace(step=state.step + 1, time=time, dt=dt, span=None)
+
+
+def _check_meanings(effect: BoundEffect, state: State) -> None:
+    """Raise InputError for a field of a state that is another quantity to the effect: a length at
+    which cells divide is no added length."""
+    for field in effect.declares():
+        there = state.declared.get(field.name)
+        if there is None or there.meaning == GIVEN:
+            continue
+        if (there.meaning, there.unit, there.scope) != (field.meaning, field.unit, field.scope):
+            about = lambda f: f"{f.meaning} ({f.unit or '1'}, per {f.scope})"
+            raise checks.InputError(
+                f"{field.name!r} of this state means {about(there)}; to {effect.title} of this"
+                f" scene it means {about(field)}. Give it first values: scene.take_over(state)."
+            )
 
 
 def _with_given(state: State, wanted: Field) -> State:
