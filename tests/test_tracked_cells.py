@@ -64,7 +64,8 @@ def test_a_parent_may_stand_in_the_first_row_alone_and_0_may_be_a_cell():
 
 def test_movies_are_apart_and_each_has_its_end():
     rows = [*ROWS, *((c, p, t, x) for c, p, t, x in ROWS if t <= 30)]
-    tree = tf.Lineage.from_table(table(rows, colony=[7] * 10 + [2] * 6))
+    with pytest.warns(UserWarning, match=r"colony 2 ends before others"):
+        tree = tf.Lineage.from_table(table(rows, colony=[7] * 10 + [2] * 6))
     second = tree.colony == 2
     assert tree.fate[second].tolist() == ["divided", "alive", "alive"]
     assert tree.descendants(1, colony=7) == [2, 3, 4, 5] and tree.descendants(1, colony=2) == [2, 3]

@@ -16,7 +16,7 @@ from torchfilm.physics.space import Faces, PeriodicSpace
 from torchfilm.physics.walls import Wall
 from torchfilm.state import CELL_TYPE, RESERVED, Field, State
 from torchfilm.tools import checks, displays
-from torchfilm.tools.row_checks import without_gradient
+from torchfilm.tools.row_checks import warn_of_rounding, without_gradient
 from torchfilm.tools.tables import Table
 from torchfilm.tools.warn_once import warn
 
@@ -172,6 +172,7 @@ class Cells(metaclass=checks.KnownKeywords):
                 cell_type=tensor(self.cell_type, torch.int64)
             )
         for name, values in self.extra.items():
+            warn_of_rounding(f"the first cells' column {name!r}", values, dtype)
             state = state.declare(Field(name, GIVEN)).with_fields(**{name: tensor(values, dtype)})
         return state
 

@@ -139,6 +139,7 @@ class Lineage:
         columns: Mapping[str, str] | None = None,
         width: float | None = None,
         join: bool = False,
+        end: float | None = None,
     ) -> Lineage:
         """Cells that a microscope has followed: a row for each cell in each frame, of a CSV file or
         of columns by name.
@@ -153,17 +154,20 @@ class Lineage:
 
         A cell is born in its first frame, if its parent is known, and divides as the first of its
         daughters begins. Without any it is "alive" in the last frame of its colony, and else
-        "lost", in its own. Raises InputError for what is no number, parents that are no cells or
-        begin no earlier than their daughters, and two rows of a cell at one time.
+        "lost", in its own. end: h, to which all movies went on, also where no cell was left. Raises
+        InputError for what is no number, parents that are no cells or begin no earlier than their
+        daughters, and two rows of a cell at one time.
         """
         units = tables.Units(pixel_size, length_unit, None, time_unit)
-        return Lineage._of_tracks(table_tracks(table, columns or {}, units, width, join))
+        return Lineage._of_tracks(table_tracks(table, columns or {}, units, width, join, end))
 
     @staticmethod
-    def from_ctc(path: str | Path, *, interval: float, join: bool = False) -> Lineage:
+    def from_ctc(
+        path: str | Path, *, interval: float, join: bool = False, end: float | None = None
+    ) -> Lineage:
         """Cells in a file of tracks of the Cell Tracking Challenge, such as man_track.txt, without
         their lengths. interval: h between frames. Else as `from_table`."""
-        return Lineage._of_tracks(challenge_tracks(path, interval, join))
+        return Lineage._of_tracks(challenge_tracks(path, interval, join, end))
 
     @staticmethod
     def _of_tracks(tracks: Tracks) -> Lineage:

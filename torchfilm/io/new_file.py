@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+
 from torchfilm.tools import checks
 from torchfilm.tools.whole_files import beside, telling
 
@@ -89,17 +91,20 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
 
 
 def check_frames(count: int, frames: object, path: Path) -> list[int]:
-    """The numbers of the frames to be written, of a file with `count`: all of them without
+    """The numbers of the frames that are asked for, of a file with `count`: all of them without
     `frames`. Raises InputError for frames that it does not have, and for none."""
     if frames is None:
         return list(range(count))
+    if isinstance(frames, np.ndarray):
+        frames = frames.reshape(-1).tolist()
     if not isinstance(frames, (list, tuple, range)) or not len(frames):
         raise checks.input_error("frames", frames, "a list of at least one frame's number")
     for k in frames:
-        if isinstance(k, bool) or not isinstance(k, int) or not -count <= k < count:
+        whole = isinstance(k, (int, np.integer)) and not isinstance(k, bool)
+        if not whole or not -count <= k < count:
             rule = f"each from {-count} to {count - 1}: {path} has {count} frames"
             raise checks.input_error("frames", frames, rule)
-    chosen = [k % count for k in frames]
+    chosen = [int(k) % count for k in frames]
     if sorted(set(chosen)) != chosen:
         raise checks.input_error("frames", frames, "in the order of time, each once")
     return chosen

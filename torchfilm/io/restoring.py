@@ -18,7 +18,7 @@ from torchfilm.scene import Scene
 from torchfilm.signals.grid import Grid
 from torchfilm.state import OUTSIDE, PER_CELL, Field, State
 from torchfilm.tools import checks
-from torchfilm.tools.warn_once import quietly
+from torchfilm.tools.warn_once import quietly, warn
 
 if TYPE_CHECKING:
     from torchfilm.io.results import Results
@@ -38,7 +38,26 @@ def cells_of(results: Results, frame: int, fields: Sequence[str] | None) -> Cell
     usual = [n for n in known if n not in SET_BY_EFFECTS and not n.endswith("_eaten")]
     extra = {n: known[n] for n in (usual if fields is None else fields)}
     columns: dict[str, Any] = {n: found.get(n) for n in own}
+    _warn_of_places(results.colony_id.tolist(), found["colony"])
     return Cells(**columns, extra=extra)
+
+
+def _warn_of_places(ids: list[int], colony: np.ndarray) -> None:
+    """Warn where first cells have other colonies than those of the run: places in its batch, up to
+    the last that has cells."""
+    if ids != list(range(len(ids))):
+        some = ", ".join(map(str, ids[:8])) + ", …" * (len(ids) > 8)
+        warn(
+            f"the run's colonies have the ids {some}; its cells become those of the"
+            f" colonies 0 to {len(ids) - 1}, in this order, of the scene that begins with them."
+            " Give values per colony in this order, too."
+        )
+    count = int(colony.max()) + 1 if len(colony) else 0
+    if 0 < count < len(ids):
+        warn(
+            f"the last {len(ids) - count} of the run's {len(ids)} colonies have no cells in this"
+            f" frame: bind(colonies={len(ids)}, cells=…) keeps their places."
+        )
 
 
 def restore_state(

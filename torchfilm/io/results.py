@@ -10,6 +10,7 @@ from pathlib import Path
 from types import EllipsisType
 from typing import Any
 
+import h5py
 import numpy as np
 import torch
 
@@ -19,6 +20,7 @@ from torchfilm.io.card import card
 from torchfilm.io.identity import check_same_scene, declared_fields
 from torchfilm.io.layout import AT_CELLS, INTERNAL_BEFORE, INTERNAL_ENDING_BEFORE
 from torchfilm.io.lineage import Lineage
+from torchfilm.io.new_file import check_frames
 from torchfilm.io.parameters import parameters_at
 from torchfilm.io.reading import (
     dataset_names,
@@ -48,7 +50,16 @@ class Results(metaclass=checks.KnownKeywords):
 
     def __init__(self, path: str | Path):
         self.path = checks.file_path("path", path)
-        self.file = open_results(self.path)
+        self._place = self.path.resolve()  # the path may be relative to a folder that is left
+        self._open = open_results(self.path)
+
+    @property
+    def file(self) -> h5py.File:
+        """The HDF5 file. Raises InputError where it is closed."""
+        if not self._open:
+            within = "read inside `with tf.Results(…) as results:`, or open it again."
+            raise InputError(f"{self.path} is closed: {within}")
+        return self._open
 
     def __enter__(self) -> Results:
         return self
@@ -58,16 +69,16 @@ class Results(metaclass=checks.KnownKeywords):
 
     def close(self) -> None:
         """Close the file, as leaving `with` does; again does nothing."""
-        self.file.close()
+        self._open.close()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.path.resolve(),)  # another process opens the file anew
+        return type(self), (self._place,)  # another process opens the file itself
 
     def __len__(self) -> int:
         return frame_count(self.file)
 
     def __repr__(self) -> str:
-        if not self.file:
+        if not self._open:
             return f"Results({str(self.path)!r}, closed)"
         when = f", {self.times[0]:g} to {self.times[-1]:g} h" if len(self) else ""
         colonies = displays.counted(len(self.colony_id), "colony", "colonies")
@@ -75,7 +86,7 @@ class Results(metaclass=checks.KnownKeywords):
         return f"Results({str(self.path)!r}, {colonies}, {frames}{when})"
 
     def _repr_html_(self) -> str:
-        return card(self, self._names("cells")) if self.file else displays.card(repr(self))
+        return card(self, self._names("cells")) if self._open else displays.card(repr(self))
 
     def _read(self, name: str, at: int | slice | EllipsisType = ...) -> Any:
         return read_dataset(self.file, name, at)
@@ -155,13 +166,13 @@ class Results(metaclass=checks.KnownKeywords):
         """Read what a run has written since. If another file has replaced this one (a resumed run,
         or a new run with `overwrite`), open that one. Raises InputError if the path has no readable
         results file; the old file stays open then."""
-        inode = self.path.stat().st_ino if self.path.exists() else None
+        inode = self._place.stat().st_ino if self._place.exists() else None
         if inode != inode_of_open(self.file):
-            old, self.file = self.file, open_results(self.path)
+            old, self._open = self.file, open_results(self._place)
             old.close()
         refresh(self.file)
 
-    def _index(self, frame: int) -> int:
+    def _index(self, frame: Any) -> int:
         try:
             frame = operator.index(frame)
         except TypeError as error:
@@ -181,23 +192,26 @@ class Results(metaclass=checks.KnownKeywords):
     @partial(checks.known_keywords, instead=BY_NUMBER)
     def cells(self, frame: int = -1, *, fields: Sequence[str] | None = None) -> Cells:
         """The cells of one frame, to start another scene from; `state` goes on with the same one.
-        Colonies are numbered by their places in the batch. fields: which recorded fields the cells
-        have; by default species and variables, and neither what growth and division set for each
-        cell themselves, such as `growth_rate`, nor what serves the numerics. Raises InputError for
-        other names."""
+        Colonies are numbered by their places in the batch; warns if their ids differ. fields: which
+        recorded fields the cells have; by default species and variables, and neither what growth
+        and division set for each cell themselves, such as `growth_rate`, nor what serves the
+        numerics. Raises InputError for other names."""
         return cells_of(self, frame, fields)
 
+    @partial(checks.known_keywords, instead=BY_NUMBER)
     def colony_fields(self, frame: int = -1) -> dict[str, np.ndarray]:
         """The fields per colony of one frame by name, each (B, …)."""
         k = self._index(frame)
         return {n: self._read(f"frames/colony/{n}", k) for n in self._names("frames/colony")}
 
+    @partial(checks.known_keywords, instead=BY_NUMBER)
     def parameters(self, frame: int = -1) -> dict[str, np.ndarray]:
         """Every parameter with one value per colony, (B,), by its path in the scene, such as
         "Circuit.parameters['k1']". A resume with `changed` may change them: NaN at frames where a
         parameter had no value per colony. Empty for a file of an earlier version."""
         return parameters_at(self.file, int(self._read("frames/step", self._index(frame))))
 
+    @partial(checks.known_keywords, instead=BY_NUMBER)
     def signals_at_cells(self, frame: int = -1) -> dict[str, np.ndarray]:
         """The concentration of each signal at the cells of one frame, (N,); NaN in frames of an
         earlier version, which did not record it."""
@@ -209,6 +223,7 @@ class Results(metaclass=checks.KnownKeywords):
         first, sizes = spans(self, [k])
         return slice(int(first[0]), int(first[0] + sizes[0]))
 
+    @partial(checks.known_keywords, instead=BY_NUMBER)
     def next_uid(self, frame: int = -1) -> np.ndarray:
         """(B,) the uid that the next cell born in each colony gets."""
         return self._read("frames/next_uid", self._index(frame))
@@ -218,6 +233,7 @@ class Results(metaclass=checks.KnownKeywords):
         """The signals of the medium; empty if the scene has no medium."""
         return self._names("signals")
 
+    @partial(checks.known_keywords, instead=BY_NUMBER)
     def grid(self, frame: int = -1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The grids of a frame: lower corners (B, 3) µm, numbers of voxels (B, 3), and the spacing
         (3,) µm. Raises InputError if the scene has no medium."""
@@ -230,6 +246,7 @@ class Results(metaclass=checks.KnownKeywords):
             np.asarray(self.file.attrs["spacing"]),
         )
 
+    @partial(checks.known_keywords, instead=BY_NUMBER)
     def signal(self, name: str, frame: int = -1) -> list[np.ndarray]:
         """Concentrations of a signal at a frame, one array (nx, ny, nz) per colony."""
         if name not in self.signal_names:
@@ -252,8 +269,10 @@ class Results(metaclass=checks.KnownKeywords):
         check_same_scene(self.file.attrs, self.path, scene)
 
     @partial(checks.known_keywords, instead=BY_NUMBER)
-    def table(self, frame: int | None = None, *, internals: bool = False) -> dict[str, np.ndarray]:
-        """One row per cell, one column per quantity: of one frame, or of all.
+    def table(
+        self, frame: int | Sequence[int] | None = None, *, internals: bool = False
+    ) -> dict[str, np.ndarray]:
+        """One row per cell, one column per quantity: of one frame, of several, or of all.
 
         frame · time, h · colony, its id · cell, unique within the colony · parent, or −1
         · x, y, z, µm · angle, rad, of the axis in the plane, and in space tilt, rad, above it ·
@@ -263,10 +282,14 @@ class Results(metaclass=checks.KnownKeywords):
         is one of those above is called field.NAME. internals: with the axis, and with the fields
         that serve the numerics.
         """
-        frames = range(len(self)) if frame is None else [self._index(frame)]
+        several = frame is None or isinstance(frame, (list, tuple, range, np.ndarray))
+        frames = check_frames(len(self), frame, self.path) if several else [self._index(frame)]
         return Tables(self, self.lineage(), internals)(frames)
 
-    def to_pandas(self, frame: int | None = None, *, internals: bool = False) -> Any:
+    @partial(checks.known_keywords, instead=BY_NUMBER)
+    def to_pandas(
+        self, frame: int | Sequence[int] | None = None, *, internals: bool = False
+    ) -> Any:
         """`table` as a pandas.DataFrame. Requires the extra `tables`."""
         return data_frame(self.table(frame, internals=internals))
 

@@ -46,10 +46,16 @@ class Tracks:
 
 
 def table_tracks(
-    table: Any, columns: Mapping[str, str], units: tables.Units, width: float | None, join: bool
+    table: Any,
+    columns: Mapping[str, str],
+    units: tables.Units,
+    width: float | None,
+    join: bool,
+    end: float | None,
 ) -> Tracks:
     """The tracks of a table with a row for each cell in each frame. width: of the cells, µm, which
-    lengths include; None where they are those of centrelines. join: see `_checked`."""
+    lengths include; None where they are those of centrelines. join: see `_checked`. end: see
+    `_ended`."""
     given = tables.Table.read(table)
     for name in columns:
         checks.choice("Lineage.from_table(columns)", name, MEANT)
@@ -77,7 +83,10 @@ def table_tracks(
     if "colony" in {**given.columns, **columns}:
         colony = _whole(given, columns.get("colony", "colony"), MOST_COLONIES)
     parent = _parents(given, columns.get("parent", "parent"), cell)
-    return _checked(_of_rows(given.source, colony, cell, parent, hours, sizes), join)
+    tracks = _of_rows(given.source, colony, cell, parent, hours, sizes)
+    if end is None:
+        _warn_of_ends(given.source, colony, hours)
+    return _checked(_ended(tracks, end, "Lineage.from_table(end)"), join)
 
 
 def _of_rows(
@@ -129,9 +138,9 @@ def _of_rows(
     )  # fmt: skip
 
 
-def challenge_tracks(path: str | Path, interval: float, join: bool) -> Tracks:
+def challenge_tracks(path: str | Path, interval: float, join: bool, end: float | None) -> Tracks:
     """The tracks of a file of the Cell Tracking Challenge: label, first and last frame, parent (0:
-    none). interval: h between frames. join: see `_checked`."""
+    none). interval: h between frames. join: see `_checked`. end: see `_ended`."""
     path = checks.file_path("Lineage.from_ctc(path)", path)
     checks.number("Lineage.from_ctc(interval)", interval, above=0.0)
     if path.is_dir() or not path.is_file():
@@ -152,10 +161,40 @@ def challenge_tracks(path: str | Path, interval: float, join: bool) -> Tracks:
     none, nothing = np.full(len(cell), np.nan), np.zeros(len(cell), np.int64)
     if len(np.unique(cell)) < len(cell) or (last < first).any():
         raise InputError(f"{path}: each label must be there once, and end after it begins.")
-    return _checked(Tracks(
+    tracks = Tracks(
         str(path), nothing, cell, np.where(parent == 0, NONE, parent), interval * first,
         interval * last, none, none, np.full(len(cell), interval * last.max()), interval,
-    ), join)  # fmt: skip
+    )  # fmt: skip
+    return _checked(_ended(tracks, end, "Lineage.from_ctc(end)"), join)
+
+
+def _ended(tracks: Tracks, end: float | None, name: str) -> Tracks:
+    """The tracks of movies that all went on to the hour `end`, also where no cell was left; or, if
+    it is None, each to its last cell."""
+    if end is None:
+        return tracks
+    end, last = checks.number(name, end), float(tracks.end.max())
+    if end < last * (1.0 - 1e-5):  # as a message writes it
+        raise checks.input_error(name, end, f"h, at least {last:g}, when cells were last seen")
+    return replace(tracks, end=np.full(len(tracks.end), max(end, last)))
+
+
+def _warn_of_ends(source: str, colony: np.ndarray, hours: np.ndarray) -> None:
+    """Warn of colonies that end before another one with the same frames, (R,) each: they may have
+    died out."""
+    frames = {int(c): np.unique(hours[colony == c]) for c in np.unique(colony)}
+    longest = max(frames.values(), key=len)
+    early = [
+        c for c, own in frames.items()
+        if len(own) < len(longest) and np.array_equal(own, longest[: len(own)])
+    ]  # fmt: skip
+    if early:
+        some, last = ", ".join(map(str, early[:8])), float(longest[-1])
+        warn(
+            f"{source}: colony {some} ends before others, the first of them at"
+            f" {min(float(frames[c][-1]) for c in early):g} h of {last:g}: the last cells count as"
+            f" alive there. If none was left, give end={last:g}, and they were lost."
+        )
 
 
 def _interval(colony: np.ndarray, hours: np.ndarray) -> float:

@@ -187,7 +187,25 @@ def _of_kind(name: str, value: Tensor, dtype: torch.dtype) -> Tensor:
         wanted = "true or false, torch.bool" if truth else f"numbers of {dtype}"
         hint = "Convert it: value > 0." if truth else f"Convert it: value.to({dtype})."
         raise checks.input_error(f"type of the field {name!r}", value.dtype, wanted, hint)
-    return value.to(dtype)
+    made = value.to(dtype)
+    if not (fraction or truth) and not torch.equal(made.to(value.dtype), value):
+        at = torch.nonzero(made.to(value.dtype) != value)[0]
+        lost = value[tuple(at.tolist())].item()
+        raise checks.input_error(f"the field {name!r}", lost, f"a number that {dtype} can hold")
+    return made
+
+
+def warn_of_rounding(name: str, values: np.ndarray, dtype: torch.dtype) -> None:
+    """Warn of whole numbers, such as those of tracks, that a type of float cannot hold."""
+    kept = torch.as_tensor(values.copy()).to(dtype).to(torch.float64).numpy()
+    lost = np.flatnonzero((values == np.round(values)) & (kept != values) & np.isfinite(values))
+    if lost.size:
+        k = int(lost[0])
+        warn(
+            f"{name} has whole numbers that {str(dtype).removeprefix('torch.')} rounds, such as"
+            f" {values[k]:.0f} to {kept[k]:.0f}: where they name cells, number these from 0, or"
+            " bind with dtype=torch.float64."
+        )
 
 
 def check_fields(

@@ -170,6 +170,8 @@ class Table:
         """A column of finite numbers, (N,) float64. Raises InputError with the first row that has
         none. optional: whether the table may do without the column, for the message."""
         values = self.columns[column]
+        if values.dtype.kind in "mM":
+            raise self._clock(column)
         try:
             if values.dtype.kind == "c":  # numpy would drop the imaginary part
                 raise TypeError
@@ -189,6 +191,15 @@ class Table:
                 f" number{more}. {hint}"
             )
         return found
+
+    def _clock(self, column: str) -> checks.InputError:
+        """For a column of dates or durations: numpy would count their nanoseconds, or what unit
+        they have."""
+        hours = f"(table[{column!r}] - table[{column!r}].min()) / pandas.Timedelta('1h')"
+        return checks.InputError(
+            f"{self.source}, column {column!r} has {self.columns[column].dtype}, and numbers are"
+            f" needed: {hours} are hours."
+        )
 
     def column(self, name: str, kind: str, columns: Mapping[str, str]) -> tuple[str, str] | None:
         """The column that holds a quantity, and the unit at the end of its name, "" where there is
