@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -231,3 +233,10 @@ def test_a_channel_inside_out_is_reported():
         tf.scenes.channel(width=-1.0)
     with pytest.raises(tf.InputError):
         tf.scenes.channel(length=-5.0).bind().start()
+
+
+@pytest.mark.parametrize("name", sorted(READY))
+def test_every_parameter_of_a_ready_scene_is_named_in_its_docstring(name):
+    made = getattr(tf.scenes, name)
+    words = set(re.findall(r"\w+", made.__doc__))
+    assert set(inspect.signature(made).parameters) <= words

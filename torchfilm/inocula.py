@@ -52,10 +52,10 @@ def inoculum(
     since cells of one length divide all at once; a dict of these by type, {0: 2.0, 1: tf.Uniform(0,
     1)}; or one for each of `count` cells, the same in all colonies. cell_radius: µm, one number, or
     a dict by type. floor: in 3-D, µm: cells lie flat on a floor at this z, in a disc or a
-    rectangle, instead of in a ball or a block. No two cells overlap. Colony k is the same whatever
-    their number. Raises InputError for shares that do not sum to 1, and where the cells do not find
-    room: rods placed one after the other at random fill at most about 45 % of an area, 30 % of a
-    volume. Warns of a share of which no cell comes.
+    rectangle, instead of in a ball or a block. No two cells overlap. seed: of all that is drawn;
+    colony k is the same however many there are. Raises InputError for shares that do not sum to 1,
+    and where the cells do not find room: rods placed one after the other at random fill at most
+    about 45 % of an area, 30 % of a volume. Warns of a share of which no cell comes.
     """
     checks.integer("count", count, least=1, hint=DIFFERENT)
     checks.integer("colonies", colonies, least=1)

@@ -31,12 +31,12 @@ class Field(metaclass=checks.KnownKeywords):
     """A named quantity that an effect declares. What no effect declares does not exist.
 
     scope: "cell" (one row a cell), "colony" (one row a colony) or "grid" (one row a voxel of the
-    state's layout; the name begins with "out."). shape: of one row. unit and meaning: for people.
-    initial: a number, or a function that returns a tensor (M, *shape) for the new rows (M,): at the
-    start and, where at_division = "reset", for daughters, when `state.births[-1]` tells of their
-    parents. It is called with (state, rows, values) where an effect declares the field, its values
-    resolved; else, as by `state.declare`, with (state, rows). at_division: "copy" or "reset".
-    internal: it serves the numerics; tables of results show it only on request.
+    state's layout; the name begins with "out."). shape: of one row. dtype: by default the state's.
+    unit and meaning: for people. initial: a number, or a function that returns a tensor (M, *shape)
+    for the new rows (M,): at the start and, where at_division = "reset", for daughters, when
+    `state.births[-1]` tells of their parents. It is called with (state, rows, values) where an
+    effect declares the field, its values resolved; else, as by `state.declare`, with (state, rows).
+    at_division: "copy" or "reset". internal: it serves the numerics; tables hide it by default.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Field(metaclass=checks.KnownKeywords):
     unit: str = ""
     scope: str = CELL
     shape: tuple[int, ...] = ()
-    dtype: torch.dtype | None = None  # None: the state's own
+    dtype: torch.dtype | None = None
     initial: float | Callable[..., Tensor] = 0.0
     at_division: str = "copy"
     internal: bool = False

@@ -23,9 +23,10 @@ def channel(
 ) -> Scene:
     """Cells in a channel from x = 0 to `length` µm, `width` µm wide.
 
-    open_ended: cells that pass the end at x = length are removed; otherwise the channel is closed
-    and pressure stops growth. With length_drag 10, the paper's, cells deep in a channel grow slower
-    than those at its mouth; with 1e5 all grow freely until the channel is full.
+    The founder grows at `rate`, 1/h; cells divide at a centreline length between `shortest` and
+    `longest` µm. open_ended: cells that pass the end at x = length are removed; otherwise the
+    channel is closed and pressure stops growth. With length_drag 10, the paper's, cells deep in a
+    channel grow slower than those at its mouth; with 1e5 all grow freely until the channel is full.
     """
     walls = Channel(width, low_end=0.0, high_end=None if open_ended else length)
     leave = [Removal(low=(-1.0, -width), high=(length, width))] if open_ended else []

@@ -35,7 +35,8 @@ def random_partition(rate: float = 1.0, start: float = 1.0, length_drag: float =
     """A species without production or decay, divided between daughters in random parts.
 
     It is the paper's `divide` example. The total amount is conserved, and cells differ more and
-    more. The colony grows freely (length_drag 1e5), so all cells divide at the same rate.
+    more. start: the founder's concentration. The colony grows at `rate`, 1/h, and freely
+    (length_drag 1e5), so all cells divide at the same rate.
     """
     return Scene(
         Rules(divide=_divide_plasmids),
@@ -63,7 +64,8 @@ def repressilator(
     dimensionless model, mᵢ' = −mᵢ + α/(1 + pⱼⁿ) + α₀, pᵢ' = β (mᵢ − pᵢ). speed: the unit of time is
     1/speed h, the mRNA's lifetime. noise: simulate molecule by molecule (tau-leaping), with
     `molecules_per_unit` molecules in a unit of concentration × µm³; otherwise deterministically.
-    The colony grows freely (length_drag 1e5), so dilution is alike in all cells.
+    The colony grows at `rate`, 1/h, and freely (length_drag 1e5), so dilution is alike in all
+    cells.
     """
     names = ("laci", "tetr", "ci")
     reactions = []
@@ -108,11 +110,12 @@ def toggle_switch(
     """Two genes that repress each other (Gardner et al. 2000), in a growing colony.
 
     Cells near the tipping point switch to one side or the other. Their descendants stay there, so
-    the colony forms sectors. x' = speed (a/(1 + yⁿ) − x) and the same for y, with a = `strength`.
+    the colony forms sectors. x' = speed (a/(1 + yⁿ) − x) and the same for y, with a = `strength`,
+    n = `power` and `speed` in 1/h.
     Founders start at x = y = `start`; by default decay, dilution and repression balance there.
     noise: simulate molecule by molecule, with `molecules_per_unit` molecules in a unit of
-    concentration × µm³. Growth dilutes in addition to decay; the colony grows freely (length_drag
-    1e5), so the balance is the same in all cells.
+    concentration × µm³. Growth, at `rate`, 1/h, dilutes in addition to decay; the colony grows
+    freely (length_drag 1e5), so the balance is the same in all cells.
     """
     reactions = []
     for name, by in (("red", "green"), ("green", "red")):

@@ -35,9 +35,9 @@ def microcolony(
 ) -> Scene:
     """A colony from one cell (Fig. 1, 2).
 
-    rate: of growth, 1/h. A cell divides at a centreline length between `shortest` and `longest` µm.
-    dim 2: strictly in the plane. dim 3: between a soft agarose below (stiffness `agarose`, μ·µm/h)
-    and a hard coverslip above.
+    rate: of growth, 1/h; law: of what, as of `Growth`. A cell divides at a centreline length
+    between `shortest` and `longest` µm. dim 2: strictly in the plane. dim 3: between a soft agarose
+    below (stiffness `agarose`, μ·µm/h) and a hard coverslip above.
 
     The colony grows freely, as those of E. coli do under a microscope. With length_drag 10, the
     paper's, pressure slows it from a hundred cells on.
@@ -63,7 +63,8 @@ def programmed_growth(
 ) -> Scene:
     """A colony in which only cells within `edge` µm of its rightmost point grow (Fig. 4).
 
-    The growing tip is pushed to the right, like a meristem. Pressure limits growth (length_drag 10,
+    The growing tip is pushed to the right, like a meristem. They grow at `rate`, 1/h, and divide at
+    a centreline length between `shortest` and `longest` µm. Pressure limits growth (length_drag 10,
     the paper's); it matters little here, since few cells grow.
     """
 
@@ -95,7 +96,8 @@ def strain_sorting(
     E. coli decide who sticks to whom. Cells do not grow. They move along their axis, at `speed`
     µm/h, reverse (`reversals`, 1/h) and turn (`turning`, rad²/h), in a round chamber of the radius
     `chamber` µm. strength, reach: of a bond between two cells of a strain, μ·µm²/h and µm. A
-    cell 1.6 µm long moves with a force of 1.6 · speed. The constants are chosen here.
+    cell 1.6 µm long moves with a force of 1.6 · speed. cells: how many there are. length_drag: as
+    of `Mechanics`. The constants are chosen here.
     """
     return Scene(
         Motility(speed, reversals=reversals, turning=turning),

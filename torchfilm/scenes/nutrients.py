@@ -39,7 +39,8 @@ def nutrient_limited(
     At the edge the nutrient is kept at `supply`. Only a rim of the colony grows. Where diffusion is
     slow, bumps of the rim grow faster and branch. Growth is `rate` (1/h) · s/(half + s).
     growth_yield: µm³ of cell from one unit of concentration × µm³. The layer is 1 µm deep, like the
-    cells. length_drag: with the default the nutrient limits growth, and pressure does not.
+    cells; the voxels are `spacing` µm wide. length_drag: with the default the nutrient limits
+    growth, and pressure does not.
     """
     edge = Dirichlet(supply)
     half_size = size / 2
@@ -97,7 +98,8 @@ def biofilm(
 
     width: µm. first: how many cells lie on the floor at the start, in each colony at places of its
     own, 5 µm apart or more. growth_yield: µm³ of cell from one unit of concentration × µm³. The
-    slice is 1 µm deep, like the cells.
+    slice is 1 µm deep, like the cells; the voxels are `spacing` µm wide. The film grows freely
+    (length_drag 1e5).
     """
     _check_slice(width, height, first, spacing)
     top = height

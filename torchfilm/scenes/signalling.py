@@ -47,11 +47,12 @@ def quorum_sensing(
 ) -> Scene:
     """Lux quorum sensing (Table 2): together the cells make enough AHL to switch LuxI on.
 
-    AHL crosses the cells' membranes and diffuses. D1: µm/h, membrane. k1, k2: AHL from LuxI. d2,
-    k3, k4: LuxI, basal and induced. g1: its decay, 1/h. The box, `size` µm wide, has no-flux faces.
-    With the constants that Table 2 prints (D1 = k1 = k4 = 1; d2 without a value, its d1 is 1e-3)
-    dilution of LuxI is faster than its induction, and nothing switches. With the constants here it
-    switches, the sooner the smaller the box.
+    AHL crosses the cells' membranes and diffuses (`diffusion`, µm²/h). D1: µm/h, membrane. k1, k2:
+    AHL from LuxI. d2, k3, k4: LuxI, basal and induced. g1: its decay, 1/h. rate: of growth, 1/h.
+    The box, `size` µm wide, in voxels of `spacing` µm, has no-flux faces. With the constants that
+    Table 2 prints (D1 = k1 = k4 = 1; d2 without a value, its d1 is 1e-3) dilution of LuxI is faster
+    than its induction, and nothing switches. With the constants here it switches, the sooner the
+    smaller the box.
 
     Pressure limits growth (length_drag 10, the paper's): the constants are for its dilution.
     """
@@ -112,9 +113,12 @@ def boundary_detector(
     Each population starts from one founder; the channel is `width` µm wide. Sources (type 0, on the
     left) make AHL by LuxI and report it by CFP. Sinks (type 1) degrade AHL by AiiA and report it by
     YFP: only those at the boundary detect it. Constants are as published (hours, µm, arbitrary
-    concentration); d3 = 0 is a strain without AiiA. flow: µm/h along the channel. rtol: relative
-    tolerance of the circuits in a step. The grid, with voxels of `spacing` = 4 µm, starts as the
-    paper's 64 × 8 × 12 voxels around the cells' plane and grows along the channel with the colony.
+    concentration): D1, through the membrane; d1, g1, of LuxI; k1, k2, of AHL by LuxI; d3, g2, of
+    AiiA (d3 = 0 is a strain without it); k5, k6, of AHL by AiiA; d2, k3, k4, dr, of both reporters,
+    basal, induced and lost; diffusion, µm²/h; rate, of growth, 1/h. flow: µm/h along the channel.
+    rtol: relative tolerance of the circuits in a step. The grid, with voxels of `spacing` = 4 µm,
+    starts as the paper's 64 × 8 × 12 voxels around the cells' plane and grows along the channel
+    with the colony.
 
     Pressure limits growth (length_drag 10, the paper's). With free growth (1e5) the published
     constants give no band: reporters are diluted faster than they are made.
@@ -174,8 +178,9 @@ def synchronized_lysis(
     for colonies of some hundred cells. AHL activates both its own synthesis and a lysis protein
     beyond `half`; make: of AHL, conc/h, `leak` of it without AHL. strength, loss: of the lysis
     protein, conc/h and 1/h. Above `threshold` cells burst, `lysis_rate` per hour, and release their
-    cargo (made at `cargo` conc/h). What flow would carry away decays, `decay` per hour, in a box
-    `size` µm wide and 1 µm deep, with no-flux faces. Growth is free.
+    cargo (made at `cargo` conc/h). Both diffuse (`diffusion`, µm²/h). What flow would carry away
+    decays, `decay` per hour, in a box `size` µm wide and 1 µm deep, in voxels of `spacing` µm, with
+    no-flux faces. Growth, at `rate`, 1/h, is free (length_drag 1e5).
     """
     corner = size / 2
     return Scene(

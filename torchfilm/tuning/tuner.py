@@ -56,8 +56,8 @@ def tune(
     to test cheaper settings.
 
     of: names of the observables that matter; by default all: "cells", "volume", "radius",
-    "overlap", species, "signal NAME". watch: a function that receives a line of text for each
-    stage of the work.
+    "overlap", species, "signal NAME". seed, device: of the probes. watch: a function that receives
+    a line of text for each stage of the work.
 
     Circuits that run molecule by molecule are probed by their smooth mean, since noise is not an
     error. Raises InputError if no settings keep the error within the limit, or if the probe cannot
