@@ -26,7 +26,7 @@ def scene_of(*more: tf.Effect, **options) -> tf.Scene:
 
 
 def drop(count: int = 2, **options) -> tf.Cells:
-    return tf.inoculum(count, 3.0, **{"types": {1: 1.0}, "center": (15.0, 0.0), **options})
+    return tf.inoculum(count, 3.0, **{"types": {1: 1.0}, "centre": (15.0, 0.0), **options})
 
 
 def grown(model: tf.Model, steps: int, state: tf.State | None = None) -> tf.State:
@@ -173,7 +173,7 @@ def test_what_comes_and_goes_between_two_steps_has_never_lived(tmp_path):
 def test_a_detached_state_still_tells_of_them(tmp_path):
     def change(model, state):
         state = model.add(state, drop(), [0])
-        return model.add(state.detach().to("cpu"), drop(1, center=(-20.0, 0.0)), [1])
+        return model.add(state.detach().to("cpu"), drop(1, centre=(-20.0, 0.0)), [1])
 
     recorded(tmp_path / "a.h5", change)
     with tf.Results(tmp_path / "a.h5") as results:
@@ -276,7 +276,7 @@ def test_columns_come_along():
     ("add", "said"),
     [
         (lambda m, s: m.add(s, s), "a tf.Cells, such as"),
-        (lambda m, s: m.add(s, drop(dim=3, center=(0, 0, 0))), "'3-D'.*2-D, as the state"),
+        (lambda m, s: m.add(s, drop(dim=3, centre=(0, 0, 0))), "'3-D'.*2-D, as the state"),
         (lambda m, s: m.add(s, tf.Cells.single(2)), "'without cell_type'.*with cell_type"),
         (lambda m, s: m.add(s, drop()), "with 'age', which the founders brought.*extra="),
         (lambda m, s: m.add(s, drop(extra={"gfq": 1.0})), "extra = 'gfq'.*'gfp'"),
@@ -299,8 +299,8 @@ def test_cells_outside_of_the_medium_are_refused():
     model = scene_of(medium).bind()
     state = model.start()
     with pytest.raises(tf.InputError, match="outside"):
-        model.add(state, drop(center=(50.0, 0.0)))
-    assert model.add(state, drop(center=(-5.0, 0.0))).cells == 5
+        model.add(state, drop(centre=(50.0, 0.0)))
+    assert model.add(state, drop(centre=(-5.0, 0.0))).cells == 5
 
 
 def test_a_medium_grows_around_them():
@@ -308,7 +308,7 @@ def test_a_medium_grows_around_them():
         a=tf.Signal(10.0), box=((-9, -9), (9, 9)), spacing=3.0, depth=1.0, outside="grow"
     )
     model = scene_of(medium).bind(2)
-    state = model.add(grown(model, 3), drop(center=(50.0, 0.0)), [1])
+    state = model.add(grown(model, 3), drop(centre=(50.0, 0.0)), [1])
     end = grown(model, 3, state)
     assert not tf.failures(end)
     low, high = (end.layout.grid.origin, end.layout.grid.origin + 3.0 * end.layout.grid.shape)

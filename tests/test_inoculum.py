@@ -44,7 +44,7 @@ def test_cells_are_scattered_evenly_in_a_box(dim):
 
 
 def test_a_disc_may_lie_elsewhere():
-    here, there = (tf.inoculum(20, 9.0, center=at, seed=1) for at in (None, (30.0, -4.0)))
+    here, there = (tf.inoculum(20, 9.0, centre=at, seed=1) for at in (None, (30.0, -4.0)))
     assert np.allclose(there.position, here.position + np.array([30.0, -4.0]))
     assert np.array_equal(there.axis, here.axis)
     flat = tf.inoculum(20, box=((0, 0), (30, 8)), dim=3, floor=0.0)
@@ -56,11 +56,11 @@ def test_a_disc_may_lie_elsewhere():
     [
         ({}, r"radius = None .* given, or box="),
         ({"radius": 5.0, "box": ((0, 0), (9, 9))}, "radius = 5.0 .* left out with a box"),
-        ({"box": ((0, 0), (9, 9)), "center": (1, 1)}, "center = .* left out with a box"),
+        ({"box": ((0, 0), (9, 9)), "centre": (1, 1)}, "centre = .* left out with a box"),
         ({"box": ((0, 9), (9, 0))}, "box = .* the lower corner first"),
         ({"box": ((0, 0, 0), (9, 9, 9))}, r"box\[0\]"),
         ({"box": 7.0}, "box = 7.0 .* the lower and the upper corner"),
-        ({"radius": 5.0, "center": (1, 2, 3)}, "center"),
+        ({"radius": 5.0, "centre": (1, 2, 3)}, "centre"),
         ({"box": ((0, 0), (9, 2))}, "box = .* wide enough .* give a greater box"),
     ],
 )

@@ -165,7 +165,7 @@ def test_a_keyword_that_nothing_takes_is_an_error(make, words):
     "make, words",
     [
         (tf.Channel, "Channel: missing a required argument: 'width'. Its parameters: width,"),
-        (lambda: tf.Sphere(center=(0, 0)), "Sphere: missing a required argument: 'radius'."),
+        (lambda: tf.Sphere(centre=(0, 0)), "Sphere: missing a required argument: 'radius'."),
         (lambda: tf.Box((0, 0)), "Box: missing a required argument: 'high'."),
         (lambda: tf.Plane(0.5), "Plane: too many positional arguments."),
         (
@@ -199,7 +199,7 @@ def test_an_argument_that_is_missing_is_named(make, words):
 
 def test_help_shows_the_parameters_of_walls_and_effects():
     """Although their class checks each call itself."""
-    assert list(inspect.signature(tf.Sphere).parameters)[:2] == ["center", "radius"]
+    assert list(inspect.signature(tf.Sphere).parameters)[:2] == ["centre", "radius"]
     assert "length_drag" in inspect.signature(tf.Mechanics).parameters
     assert pickle.loads(pickle.dumps(tf.Sphere((0, 0), 1.0))) == tf.Sphere((0, 0), 1.0)
 

@@ -466,7 +466,7 @@ def test_a_sheet_of_a_state_has_the_walls_that_the_picture_of_its_file_has(tmp_p
 def test_each_colonys_own_walls_are_drawn(tmp_path):
     walls = [
         tf.Channel(width=[4.0, 6.0], low_end=-8.0),
-        tf.Sphere(center=(5.0, 0.0), radius=[1.0, 2.0], inside=False),
+        tf.Sphere(centre=(5.0, 0.0), radius=[1.0, 2.0], inside=False),
     ]
     first, second = walls_drawn(tmp_path, walls, "xy", dim=2, colonies=2)
     for drawn, half, radius in ((first, 2.0, 1.0), (second, 3.0, 2.0)):

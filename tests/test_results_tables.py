@@ -201,6 +201,25 @@ def test_files_of_earlier_versions_are_read_and_resumed(tmp_path):
     assert np.array_equal(table["k"], table["colony"] + 1.0)
 
 
+def test_round_walls_of_earlier_versions_are_read_and_resumed(tmp_path):
+    """Their `centre` was called center."""
+    path = tmp_path / "run.h5"
+    walls = [tf.Sphere(centre=(1.0, 0.0), radius=9.0), tf.Plane(y=-5.0, facing="+y")]
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2, walls=walls))
+    tf.simulate(scene, until=0.2, record=path).last()
+    with tf.Results(path) as results:
+        now = results.walls
+    with h5py.File(path, "a") as file:
+        for name in ("walls", "effects"):
+            assert "centre" in file.attrs[name]
+            file.attrs[name] = file.attrs[name].replace("centre", "center")
+    with tf.Results(path) as results:
+        assert results.walls == now and now[0]["centre"] == [1.0, 0.0]
+        state = results.state(scene)
+    tf.simulate(scene, state, until=0.4, record=tf.Recorder(path, scene, append=True)).last()
+    tf.show(path, out=tmp_path / "run.png")
+
+
 def test_a_field_named_as_a_column_is_kept_beside_it(tmp_path):
     def update(cells):
         cells.age = cells.age + 1.0

@@ -128,7 +128,7 @@ STATED = tf.PerColony([5.0, 6.0])
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: tf.Mechanics([tf.Sphere(center=(0.0, 0.0), radius=STATED)], dim=2),
+        lambda: tf.Mechanics([tf.Sphere(centre=(0.0, 0.0), radius=STATED)], dim=2),
         lambda: tf.Mechanics([tf.Plane(y=STATED, facing="-y")], dim=2),
         lambda: tf.Mechanics([tf.Box((-5.0, -5.0), (STATED, 9.0))], dim=2),
         lambda: tf.Removal(low=(-9.0, -9.0), high=(STATED, 9.0)),

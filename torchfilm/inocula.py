@@ -28,7 +28,7 @@ def inoculum(
     radius: float | None = None,
     *,
     box: tuple[Sequence[float], Sequence[float]] | None = None,
-    center: Sequence[float] | None = None,
+    centre: Sequence[float] | None = None,
     types: Mapping[int, float] | None = None,
     extra: Mapping[str, Any] | None = None,
     colonies: int = 1,
@@ -44,7 +44,7 @@ def inoculum(
 
     radius: of the disc, in 3-D the ball, that contains their centres, µm. box: in its place the
     lower and upper corner of the rectangle, or block, that does: box=((0, 0), (100, 4)) for a
-    front. center: of the disc, µm, by default the origin. types: the share of each cell type, which
+    front. centre: of the disc, µm, by default the origin. types: the share of each cell type, which
     together are 1; each colony has these shares, as near as whole numbers of cells come to them,
     and who is of which type is drawn; or their numbers, {0: 3, 1: 27}, which together are `count`.
     extra: variables of the cells by name, one number, or a dict by type: {"plasmids": {0: 4, 1:
@@ -72,7 +72,7 @@ def inoculum(
         checks.number("floor", floor)
         if dim == 2:
             raise checks.input_error("floor", floor, "left out with dim=2", "Take dim=3.")
-    place = _place(radius, box, center, 2 if floor is not None else dim)
+    place = _place(radius, box, centre, 2 if floor is not None else dim)
     made = [
         _colony(np.random.default_rng([seed, k]), place, lengths[k], radii[k])
         for k in range(colonies)
@@ -227,17 +227,17 @@ class _Disc:
     """A disc or a ball."""
 
     radius: float
-    center: np.ndarray
+    centre: np.ndarray
     name = "radius"
 
     @property
     def dim(self) -> int:
-        return len(self.center)
+        return len(self.centre)
 
     def places(self, rng: np.random.Generator, way: np.ndarray) -> np.ndarray:
         """As many as there are ways, (n, dim): unit vectors at random."""
         n, dim = way.shape
-        return self.center + self.radius * rng.random((n, 1)) ** (1 / dim) * way
+        return self.centre + self.radius * rng.random((n, 1)) ** (1 / dim) * way
 
     def size(self, margin: float) -> float:
         """Area or volume, with a margin around."""
@@ -272,15 +272,15 @@ class _Block:
         return self.low.tolist(), self.high.tolist()
 
 
-def _place(radius: Any, box: Any, center: Any, dim: int) -> _Disc | _Block:
+def _place(radius: Any, box: Any, centre: Any, dim: int) -> _Disc | _Block:
     """Where the centres of cells lie, checked."""
     if box is None:
         if radius is None:
             raise checks.input_error("radius", None, "given, or box=((x, y), (x, y)), µm")
         checks.number("radius", radius, least=0.0)
-        at = (0.0,) * dim if center is None else checks.vector("center", center, dim)
+        at = (0.0,) * dim if centre is None else checks.vector("centre", centre, dim)
         return _Disc(float(radius), np.array(at))
-    for name, value in (("radius", radius), ("center", center)):
+    for name, value in (("radius", radius), ("centre", centre)):
         if value is not None:
             raise checks.input_error(name, value, "left out with a box")
     if not isinstance(box, (tuple, list)) or len(box) != 2:

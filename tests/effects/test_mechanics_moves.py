@@ -151,7 +151,7 @@ def test_a_heap_drives_no_cell_through_a_wall(backend, contacts):
 def test_both_paths_cut_the_same_moves_at_walls(dim, wall):
     """Two steps of heaps at walls, of one pass each: two heaps, and more until a move is cut."""
     if isinstance(wall, tf.Sphere):
-        wall = tf.Sphere(wall.center[:dim], wall.radius, inside=wall.inside)
+        wall = tf.Sphere(wall.centre[:dim], wall.radius, inside=wall.inside)
     no_limit = lambda self, at, made: torch.ones_like(self.given.radius)
     none = (
         nullcontext(),

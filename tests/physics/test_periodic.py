@@ -423,7 +423,7 @@ def test_what_does_not_fit_a_periodic_space_is_refused():
     with pytest.raises(tf.InputError, match="the Plane ends space along x"):
         tf.Mechanics(dim=2, periodic=faces, walls=[tf.Plane(x=0, facing="+x")])
     with pytest.raises(tf.InputError, match="the Sphere ends space along x"):
-        tf.Mechanics(dim=2, periodic=faces, walls=[tf.Sphere(center=(20, 0), radius=10)])
+        tf.Mechanics(dim=2, periodic=faces, walls=[tf.Sphere(centre=(20, 0), radius=10)])
     tf.Mechanics(dim=2, periodic=faces, walls=[tf.Plane(y=0, facing="+y")])
     scene = tf.Scene(tf.Mechanics(dim=2, periodic=faces))
     with pytest.raises(tf.InputError, match=r"cell 0 of colony 0 starts at .* beyond the faces"):

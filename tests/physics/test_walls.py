@@ -20,15 +20,15 @@ WALLS_3D = {
     "plane": tf.Plane(x=0.3, facing="+x"),
     "plane facing down": tf.Plane(z=0.2, facing="-z"),
     "tilted plane": tf.Plane(point=(0.1, 0.0, -0.2), normal=(1.0, 2.0, -0.5)),
-    "inside a sphere": tf.Sphere(center=(0.2, 0.0, 0.1), radius=2.5),
-    "outside a sphere": tf.Sphere(center=(0.2, 0.0, 0.1), radius=1.5, inside=False),
+    "inside a sphere": tf.Sphere(centre=(0.2, 0.0, 0.1), radius=2.5),
+    "outside a sphere": tf.Sphere(centre=(0.2, 0.0, 0.1), radius=1.5, inside=False),
     "box": tf.Box(low=(-1, -2, -INF), high=(1.5, 2, 1)),
     "channel": tf.Channel(width=2.0, height=3.0, low_end=-2.0, high_end=None),
 }
 WALLS_2D = {
     "plane": tf.Plane(y=0.3, facing="+y"),
-    "inside a circle": tf.Sphere(center=(0.2, 0.0), radius=2.5),
-    "outside a circle": tf.Sphere(center=(0.2, 0.0), radius=1.5, inside=False),
+    "inside a circle": tf.Sphere(centre=(0.2, 0.0), radius=2.5),
+    "outside a circle": tf.Sphere(centre=(0.2, 0.0), radius=1.5, inside=False),
     "channel": tf.Channel(width=2.0, high_end=2.0),
 }
 ALL = [pytest.param(3, w, id=f"3-D {n}") for n, w in WALLS_3D.items()] + [
@@ -41,7 +41,7 @@ def distance(wall: tf.Plane, p: np.ndarray) -> np.ndarray:
     arguments.
     """
     if isinstance(wall, tf.Sphere):
-        away = np.linalg.norm(p - np.array(wall.center), axis=-1)
+        away = np.linalg.norm(p - np.array(wall.centre), axis=-1)
         return (wall.radius - away if wall.inside else away - wall.radius)[..., None]
     if isinstance(wall, tf.Plane):
         if wall.point is not None:
@@ -63,7 +63,7 @@ def distance(wall: tf.Plane, p: np.ndarray) -> np.ndarray:
 
 def foot(wall: tf.Sphere, rods: Rods) -> np.ndarray:
     """The position along each rod, −1 … +1, that is nearest to the ball's centre."""
-    along = ((np.array(wall.center) - array(rods.position)) * array(rods.axis)).sum(1)
+    along = ((np.array(wall.centre) - array(rods.position)) * array(rods.axis)).sum(1)
     return np.clip(along / (0.5 * array(rods.length)), -1, 1)
 
 
@@ -175,12 +175,12 @@ def test_a_ball_in_the_way_is_met_between_the_ends(dtype, device, dim):
     """A rod on a small ball: its middle touches, its ends do not, and it is pushed without a
     torque.
     """
-    center = (0.1, -0.9, 0.0)[:dim]
+    centre = (0.1, -0.9, 0.0)[:dim]
     rods = Rods(dim, 1, dtype, device)
     rods.position[:] = 0.0
     rods.axis[:] = torch.eye(dim)[0]
     rods.length[:] = 4.0
-    found = rods.rows(tf.Sphere(center=center, radius=0.5, inside=False))
+    found = rods.rows(tf.Sphere(centre=centre, radius=0.5, inside=False))
     assert found.cell.tolist() == [0]
     assert float(found.gap[0]) == pytest.approx(0.9 - 0.5 - 0.5, abs=1e-6)
     row = array(found.row)[0]
@@ -222,7 +222,7 @@ def test_the_force_of_a_ball_never_jumps(dtype, device, dim, radius, way):
             torch.cos(0.4 * t).to(dtype),
             torch.sin(0.4 * t).to(dtype),
         )
-    ball = tf.Sphere(center=(0.0, -0.2 - radius, 0.0)[:dim], radius=radius, inside=False)
+    ball = tf.Sphere(centre=(0.0, -0.2 - radius, 0.0)[:dim], radius=radius, inside=False)
     found = force(rods, ball)
     at = foot(ball, rods)
     assert at.min() == -1 and np.abs(at).min() < 0.9, (
@@ -243,7 +243,7 @@ def test_a_very_large_ball_is_a_plane_to_a_rod_that_stands_askew(dtype, device, 
     rods = Rods(3, 1, dtype, device)
     rods.position[:], rods.length[:] = 0.0, length
     rods.axis[:] = torch.tensor([math.cos(0.1), 0.0, math.sin(0.1)])
-    on_ball = force(rods, tf.Sphere(center=(0, 0, -1e5 - 0.1), radius=1e5, inside=False))
+    on_ball = force(rods, tf.Sphere(centre=(0, 0, -1e5 - 0.1), radius=1e5, inside=False))
     on_plane = force(rods, tf.Plane(z=-0.1, facing="+z"))
     assert float(on_plane.abs().max()) > 0.1
     assert float((on_ball - on_plane).abs().max()) <= 2e-5
@@ -272,7 +272,7 @@ def test_a_wall_may_stand_elsewhere_in_each_colony(dtype, device):
     found = rods.rows(tf.Plane(x=torch.tensor([-0.3, -0.7]), facing="+x"))
     assert found.cell.tolist() == [0, 0]
     assert array(found.gap) == pytest.approx(np.array([-0.2, -0.2]), abs=1e-6)
-    found = rods.rows(tf.Sphere(center=(0, 0, 0), radius=torch.tensor([9.0, 1.0])))
+    found = rods.rows(tf.Sphere(centre=(0, 0, 0), radius=torch.tensor([9.0, 1.0])))
     assert set(found.cell.tolist()) == {1}
 
 
@@ -311,7 +311,7 @@ def test_no_row_where_there_is_room(dim, wall):
 @pytest.mark.parametrize(
     "wall, start",
     [
-        (tf.Sphere(center=(0, 0, 0), radius=3.0), [0.0, 0.5, 0.0]),
+        (tf.Sphere(centre=(0, 0, 0), radius=3.0), [0.0, 0.5, 0.0]),
         (tf.Box(low=(-3, -1, -1), high=(3, 1, 1)), [0.0, 0.2, 0.0]),
         (tf.Channel(width=2.0, height=2.0, low_end=-3.0, high_end=3.0), [0.0, 0.2, 0.0]),
     ],
@@ -344,22 +344,22 @@ def test_a_growing_cell_stays_inside(dtype, device, wall, start):
         lambda: tf.Plane(x=0.0, facing="+x", weight=0.0),
         lambda: tf.Plane(x=0.0, facing="+x", weight=1.5),
         lambda: tf.Plane(x=0.0, facing="+x", weight=0.5, stiffness=1.0),
-        lambda: tf.Sphere(center=(0, 0), radius=0.0),
+        lambda: tf.Sphere(centre=(0, 0), radius=0.0),
         lambda: tf.Box(low=(0, 0), high=(1, 0)),
         lambda: tf.Box(low=(0, 0), high=(1, 1, 1)),
         lambda: tf.Channel(width=-1.0),
         lambda: tf.Channel(width=1.0, low_end=1.0, high_end=0.0),
         lambda: tf.Channel(width=1.0, height=1.0).surfaces(2),
         lambda: tf.Plane(z=0.0, facing="+z").surfaces(2),
-        lambda: tf.Sphere(center=(0, 0), radius=1.0).surfaces(3),
-        lambda: tf.Sphere(center=torch.zeros(4, 2), radius=1.0).surfaces(3),
-        lambda: tf.Sphere(center=torch.zeros(2, 2, 2), radius=1.0),
-        lambda: tf.Sphere(center=torch.zeros(0, 2), radius=1.0),
-        lambda: tf.Sphere(center=[[0.0, 0.0], [0.0]], radius=1.0),
-        lambda: tf.Sphere(center=torch.tensor([[0.0, INF], [0.0, 0.0]]), radius=1.0),
-        lambda: tf.Sphere(center=(torch.zeros(2), torch.zeros(3)), radius=1.0),
-        lambda: tf.Sphere(center="here", radius=1.0),
-        lambda: tf.Sphere(center=1.0, radius=1.0),
+        lambda: tf.Sphere(centre=(0, 0), radius=1.0).surfaces(3),
+        lambda: tf.Sphere(centre=torch.zeros(4, 2), radius=1.0).surfaces(3),
+        lambda: tf.Sphere(centre=torch.zeros(2, 2, 2), radius=1.0),
+        lambda: tf.Sphere(centre=torch.zeros(0, 2), radius=1.0),
+        lambda: tf.Sphere(centre=[[0.0, 0.0], [0.0]], radius=1.0),
+        lambda: tf.Sphere(centre=torch.tensor([[0.0, INF], [0.0, 0.0]]), radius=1.0),
+        lambda: tf.Sphere(centre=(torch.zeros(2), torch.zeros(3)), radius=1.0),
+        lambda: tf.Sphere(centre="here", radius=1.0),
+        lambda: tf.Sphere(centre=1.0, radius=1.0),
         lambda: tf.Plane(point=(0, 0), normal=torch.tensor([[0.0, 1.0], [0.0, 0.0]])),
         lambda: tf.Plane(point=torch.zeros(2, 2), normal=torch.ones(3, 2)),
         lambda: tf.Plane(point=torch.zeros(2, 2), normal=(0, 0, 1)),

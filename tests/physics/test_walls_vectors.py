@@ -15,8 +15,8 @@ NORMALS = [[1.0, 2.0, -0.5], [0.3, -1.0, 0.2], [-3.0, 0.5, 0.1]]
 
 # a wall from a given vector, one or one per colony
 MOVED = {
-    "inside a sphere": lambda v: tf.Sphere(center=v, radius=2.5),
-    "outside a sphere": lambda v: tf.Sphere(center=v, radius=1.5, inside=False),
+    "inside a sphere": lambda v: tf.Sphere(centre=v, radius=2.5),
+    "outside a sphere": lambda v: tf.Sphere(centre=v, radius=1.5, inside=False),
     "point of a plane": lambda v: tf.Plane(point=v, normal=(1.0, 2.0, -0.5)[: np.shape(v)[-1]]),
     "normal of a plane": lambda v: tf.Plane(point=(0.1, 0.0, -0.2)[: np.shape(v)[-1]], normal=v),
 }
@@ -105,10 +105,10 @@ def test_a_scene_counts_a_walls_vectors():
     """Vectors for two colonies in a batch of three, or of one, raise an error with the name at
     once.
     """
-    scene = tf.Scene(tf.Mechanics(walls=[tf.Sphere(center=[[0.0, 0, 0], [0.1, 0, 0]], radius=5.0)]))
+    scene = tf.Scene(tf.Mechanics(walls=[tf.Sphere(centre=[[0.0, 0, 0], [0.1, 0, 0]], radius=5.0)]))
     assert scene.bind(2).start().colonies == 2
     for count in (1, 3):
-        with pytest.raises(tf.InputError, match=r"center.*2 values"):
+        with pytest.raises(tf.InputError, match=r"centre.*2 values"):
             scene.bind(count).start()
-    one = tf.Scene(tf.Mechanics(walls=[tf.Sphere(center=torch.zeros(3), radius=5.0)]))
+    one = tf.Scene(tf.Mechanics(walls=[tf.Sphere(centre=torch.zeros(3), radius=5.0)]))
     assert one.bind(2).start().colonies == 2, "one vector serves any number of colonies"

@@ -78,6 +78,7 @@ def check_same_scene(attributes: Mapping[str, Any], path: object, scene: Scene) 
     """Raise InputError unless `scene` has the effects, the parameters and the code of functions
     that the file's attributes list."""
     was, code = (json.loads(attributes.get(name, "null")) for name in ("effects", "code"))
+    was = was and [text.replace("Sphere(center=", "Sphere(centre=") for text in was]  # as once
     differs = scene.difference(was, code)
     if differs:
         raise InputError(

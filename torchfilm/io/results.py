@@ -143,9 +143,10 @@ class Results(metaclass=checks.KnownKeywords):
     @property
     def walls(self) -> list[dict[str, Any]]:
         """The surfaces that cells could not pass. A flat one has "normal" and "offset" (normal · x
-        on it, µm), a round one "center" and "radius", µm. Each entry is one number, or a list of
+        on it, µm), a round one "centre" and "radius", µm. Each entry is one number, or a list of
         one per colony. "soft" says whether the surface yields."""
-        return read_attribute(self.file, "walls", "[]")
+        found = read_attribute(self.file, "walls", "[]")  # of earlier versions with "center"
+        return [{n.replace("center", "centre"): x for n, x in wall.items()} for wall in found]
 
     @property
     def periodic(self) -> dict[str, tuple[float, float]]:

@@ -219,7 +219,7 @@ def wall_arrays(
         if isinstance(surface, FlatSurface):
             place, size, kinds[k] = surface.normal, surface.offset, rows.FLAT
         else:
-            place, size = surface.center, surface.radius
+            place, size = surface.centre, surface.radius
             kinds[k] = rows.INSIDE if surface.inside else rows.OUTSIDE
         for c, entry in enumerate(place):
             places[k, :, c] = _of_colonies(entry, ids)

@@ -45,13 +45,13 @@ class RoundSurface:
     """A sphere of a wall (a circle in 2-D), with cells inside or outside."""
 
     wall: Wall
-    center: Vector
+    centre: Vector
     radius: float | Tensor
     inside: bool
 
     def gap_of_points(self, points: Tensor, colony: Tensor) -> tuple[Tensor, Tensor]:
         """As for a flat surface."""
-        out = (points - _vectors(self.center, colony, points)).T
+        out = (points - _vectors(self.centre, colony, points)).T
         distance = safe_norm(out)
         radius = per_cell(self.radius, colony, points)
         # at the exact centre all directions lead equally far to the wall; the first axis is taken
@@ -77,7 +77,7 @@ class RoundSurface:
         """Where each cell's axis is nearest to the sphere's centre, from the cell's centre, (P,)
         µm.
         """
-        return ((_vectors(self.center, colony, position) - position) * axis).sum(1)
+        return ((_vectors(self.centre, colony, position) - position) * axis).sum(1)
 
 
 Surface = FlatSurface | RoundSurface
@@ -86,7 +86,7 @@ Surface = FlatSurface | RoundSurface
 def as_data(surface: Surface) -> dict[str, Any]:
     """A surface as plain numbers, for a file.
 
-    A flat surface has normal and offset (normal · x, µm); a round one has center and radius, µm.
+    A flat surface has normal and offset (normal · x, µm); a round one has centre and radius, µm.
     Each entry is one number or a list of one per colony. soft: whether the wall yields.
     """
     number = lambda x: x.detach().cpu().tolist() if isinstance(x, Tensor) else float(x)
@@ -98,7 +98,7 @@ def as_data(surface: Surface) -> dict[str, Any]:
             "soft": soft,
         }
     return {
-        "center": [number(c) for c in surface.center],
+        "centre": [number(c) for c in surface.centre],
         "radius": number(surface.radius),
         "soft": soft,
     }

@@ -190,28 +190,28 @@ class Plane(Wall):
 class Sphere(Wall):
     """A sphere (a circle in 2-D) that keeps cells inside, or outside with inside=False.
 
-    center: µm, one position or one per colony as an array of shape (B, d). radius: µm. stiffness,
+    centre: µm, one position or one per colony as an array of shape (B, d). radius: µm. stiffness,
     weight: as of `Plane`.
     """
 
     turn_hint = "Is the wall inside out? Change `inside`, or move the cell."
 
-    center: Sequence[float | Tensor] | Tensor
+    centre: Sequence[float | Tensor] | Tensor
     radius: checks.Value
     inside: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "center", _vector("Sphere.center", self.center))
+        object.__setattr__(self, "centre", _vector("Sphere.centre", self.centre))
         object.__setattr__(self, "radius", checks.value("Sphere.radius", self.radius, above=0.0))
 
     def surfaces(self, dim: int) -> list[Surface]:
-        if len(tuple(self.center)) != dim:
+        if len(tuple(self.centre)) != dim:
             raise checks.input_error(
-                "Sphere.center", tuple(self.center), f"of {dim} numbers in a {dim}-D scene"
+                "Sphere.centre", tuple(self.centre), f"of {dim} numbers in a {dim}-D scene"
             )
         radius = cast("Kept", self.radius)
-        return [RoundSurface(self, tuple(self.center), radius, self.inside)]
+        return [RoundSurface(self, tuple(self.centre), radius, self.inside)]
 
 
 @dataclass(frozen=True)

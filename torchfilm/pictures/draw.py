@@ -258,9 +258,9 @@ def add_walls(ax: Axes, walls: Sequence[Mapping[str, Any]], colony: int, view: s
     flat = []
     for wall in walls:
         if "radius" in wall:
-            center = tuple(own(wall["center"][k]) for k in seen)
+            centre = tuple(own(wall["centre"][k]) for k in seen)
             round_wall = {"fill": False, "linestyle": dashes(wall), **style}
-            ax.add_patch(Circle(center, own(wall["radius"]), **round_wall))
+            ax.add_patch(Circle(centre, own(wall["radius"]), **round_wall))
             continue
         normal = np.array([own(wall["normal"][k]) for k in seen])
         if np.hypot(*normal) > 1.0 - 1e-6:

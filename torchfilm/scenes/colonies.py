@@ -103,7 +103,7 @@ def strain_sorting(
         Motility(speed, reversals=reversals, turning=turning),
         Mechanics(
             dim=2,
-            walls=[Sphere(center=(0.0, 0.0), radius=chamber)],
+            walls=[Sphere(centre=(0.0, 0.0), radius=chamber)],
             length_drag=length_drag,
             adhesion=[
                 Adhesion(ByType({0: strength, 1: 0.0}), reach),
