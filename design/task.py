@@ -103,7 +103,10 @@ class Task(TaskOptions):
         if self.until is None and self.cells is None:
             self._set(until=own)
         until = _check_options(self)
-        function, fixed = scene_function(self.scene), dict(self.fixed or {})
+        function = scene_function(self.scene)
+        # numbers of NumPy would be written so in a study, which is read as plain text
+        plain = lambda x: x.item() if isinstance(x, np.generic) else x
+        fixed = {name: plain(value) for name, value in (self.fixed or {}).items()}
         space, conditions = Space(self.parameters), self.target.arguments
         family = SceneFamily(function, space, fixed, self.device, conditions)
         if of_seeds(self.target) and self.replicates < 2:

@@ -86,3 +86,54 @@ def test_a_run_without_cells_has_none(tmp_path):
     list(tf.simulate(none, until=0.1, record=tmp_path / "b.h5"))
     with pytest.raises(tf.InputError, match="no cell in any frame"):
         tf.pictures.kymograph(tmp_path / "b.h5", "length")
+
+
+def still(path, select=None, place=((-3.0, 0.0), (3.0, 0.0)), length=(0.0, 4.0)):
+    """Two colonies at rest, of these cells and of two as long as 1 µm, in this order."""
+    cells = tf.Cells([*place] * 2, [1.0, 0.0], [*length, 1.0, 1.0], colony=[0, 0, 1, 1])
+    scene = tf.Scene(tf.Growth(rate=0.0), founders=cells, dim=2, dt=0.1)
+    state = scene.bind().start()
+    state = state if select is None else state.select(select)
+    tf.simulate(scene, state, until=0.3, record=tf.Recorder(path, scene, every=1)).last()
+    return path
+
+
+def drawn(picture) -> np.ndarray:
+    return mesh(picture).get_array().filled(np.nan)
+
+
+def test_a_colony_goes_by_its_id(tmp_path):
+    path = still(tmp_path / "swapped.h5", select=[1, 0])
+    for colony, wanted in ((0, {0.0, 4.0}), (1, {1.0}), (None, {1.0})):
+        given = {} if colony is None else {"colony": colony}
+        last = drawn(tf.pictures.kymograph(path, "length", **given))[-1]
+        assert {*last[np.isfinite(last)]} == wanted
+    alone = still(tmp_path / "alone.h5", select=[1])
+    assert len(drawn(tf.pictures.kymograph(alone, "length", colony=1))) == 4
+
+
+def test_the_centre_is_that_of_the_volume(tmp_path):
+    path = still(tmp_path / "run.h5")
+    edges = mesh(tf.pictures.kymograph(path, "length", along="radius")).get_coordinates()[0, :, 0]
+    volume = np.pi * 0.25 * np.array([0.0, 4.0]) + 4 / 3 * np.pi * 0.125
+    x = np.array([-3.0, 3.0])
+    far = abs(x - (volume * x).sum() / volume.sum())
+    assert edges[0] == np.floor(far.min()) and edges[-1] == np.floor(far.max()) + 1
+
+
+@pytest.mark.parametrize("edges", [[-20.0, -10.0], [10.0, 20.0]])
+def test_a_range_without_cells_is_refused(tmp_path, edges):
+    path = still(tmp_path / "run.h5")
+    with pytest.raises(tf.InputError, match="a range with cells"):
+        tf.pictures.kymograph(path, "length", edges=edges)
+
+
+def test_a_frame_without_cells_is_empty(tmp_path):
+    path = tmp_path / "gone.h5"
+    scene = tf.Scene(tf.Growth(rate=0.0), founders=tf.Cells(PLACES, [1.0, 0.0]), dim=2, dt=0.1)
+    run = tf.simulate(scene, until=0.4, record=tf.Recorder(path, scene, every=1))
+    state = next(run)
+    run.send(state.remove(state.length >= 0.0, "removed"))
+    run.last()
+    found = drawn(tf.pictures.kymograph(path, "length", along="radius"))
+    assert np.isfinite(found[0]).any() and np.isnan(found[-1]).all()

@@ -169,3 +169,63 @@ def test_whole_numbers_that_floats_round_are_remarked_on():
     assert state.track.tolist() == [5, 2**53]
     with pytest.raises(tf.InputError, match=r"field 'track' = 9007199254740993.*float64 can hold"):
         exact.with_fields(track=torch.tensor([5, 2**53 + 1]))
+
+
+def plain() -> tf.Scene:
+    return tf.Scene(tf.Growth(rate=1.0), tf.Division(length=tf.Normal(4.0, 0.4)), dim=2, dt=0.05)
+
+
+def edited(tmp_path, edit, **field):
+    """A run whose state is edited after its first step, and what it leaves."""
+    path, scene = tmp_path / "run.h5", plain()
+    state = scene.bind().start()
+    state = state.declare(tf.Field("dose", "", **field)) if field else state
+    run = tf.simulate(scene, state, until=0.5, record=tf.Recorder(path, scene, every=1))
+    state = next(run)
+    try:
+        run.send(edit(state))
+    finally:
+        with tf.Results(path) as results:
+            assert len(results) == 2 and results.table()["frame"].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("scope", ["cell", "colony"])
+def test_columns_neither_come_nor_go(tmp_path, scope):
+    """The file had been unreadable, unsaid."""
+    without = lambda s: s.replace(fields={n: x for n, x in s.fields.items() if n != "dose"})
+    with pytest.raises(tf.SimulationError, match=r"field 'dose' of .*run\.h5 is gone from"):
+        edited(tmp_path, without, scope=scope)
+    (tmp_path / "run.h5").unlink()
+    with pytest.raises(tf.SimulationError, match=r"field 'dose' appeared during the run"):
+        edited(tmp_path, lambda s: s.declare(tf.Field("dose", "", scope=scope)))
+
+
+def test_a_medium_does_not_come_into_a_file(tmp_path):
+    medium = tf.Medium(food=tf.Signal(10.0), box=((-9, -9), (9, 9)), spacing=3.0)
+    fed = plain().replace(*plain().effects, medium)
+    with pytest.raises(tf.SimulationError, match=r"signal 'food' appeared during the run"):
+        edited(tmp_path, fed.take_over)
+
+
+@pytest.mark.parametrize("change", [{"stream": torch.tensor([5])}, {"seed": 5}])
+def test_a_recorded_run_draws_from_one_stream(tmp_path, change):
+    """Resumed, it had been another one."""
+    with pytest.raises(tf.InputError, match=r"other random numbers at step 2 .*seed.*streams"):
+        edited(tmp_path, lambda s: s.replace(**change))
+
+
+def test_a_resumed_file_keeps_its_interval_from_its_first_frame(tmp_path):
+    path, scene = tmp_path / "run.h5", plain()
+    state = tf.simulate(scene, until=0.15).last()
+    tf.simulate(scene, state, until=0.4, record=tf.Recorder(path, scene, every=4)).last()
+    record = tf.Recorder(path, scene, append=True)
+    for until, steps in ((0.8, [3, 7, 8, 11, 15, 16]), (1.0, [3, 7, 8, 11, 15, 16, 19, 20])):
+        with tf.Results(path) as results:
+            state = results.state(scene)
+        last = tf.simulate(scene, state, until=until, record=record).last()
+        with tf.Results(path) as results:
+            assert results.steps.tolist() == steps
+            assert torch.equal(results.state(scene).length, last.length)
+    with pytest.raises(tf.InputError, match="streams"):
+        other = last.replace(stream=last.stream + 5)
+        tf.simulate(scene, other, until=2.0, record=tf.Recorder(path, scene, append=True)).last()

@@ -396,3 +396,43 @@ def test_a_state_that_was_edited_is_checked_before_it_is_run(change, words):
     with pytest.raises(tf.InputError, match="one value for each cell"):
         short = state.with_fields(growth_rate=state.growth_rate[:2])
         tf.simulate(model, short, until=0.1)
+
+
+def plain() -> tf.Scene:
+    return tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), dim=2, dt=0.05)
+
+
+def test_a_stream_is_that_of_the_place():
+    state = plain().bind(3, seed=7).start().replace(stream=torch.tensor([7, 9, 7]))
+    assert state.own_stream.tolist() == [7, 9, 7] and state.select([1]).own_stream.tolist() == [9]
+    assert plain().bind(state=state).seed == 7
+
+
+@pytest.mark.parametrize("initial", [0.0, lambda state, rows: torch.zeros(len(rows))])
+def test_fields_of_colonies_stay_as_cells_divide(initial):
+    field = tf.Field("dose", "", scope="colony", at_division="reset", initial=initial)
+    state = plain().bind(2).start().declare(field).with_fields(dose=torch.tensor([1.0, 2.0]))
+    model = plain().bind(state=state)
+    while not state.births:
+        state = model.step(state)
+    made = state.reset_at_division(torch.tensor([0, 1]), ["dose"])
+    assert state.dose.tolist() == made.dose.tolist() == [1.0, 2.0]
+
+
+def test_arrivals_move_with_a_state_and_a_selection_has_none():
+    model = plain().bind(2)
+    state = model.add(model.start(), tf.Cells([[20.0, 0.0]], [[1.0, 0.0]]))
+    assert state.arrived and not state.select([0]).arrived
+    real = lambda x: isinstance(x, torch.Tensor) and x.is_floating_point()
+    moved = state.moved(lambda x: x.double() if real(x) else x)
+    assert moved.arrived[0].length.dtype == torch.float64
+
+
+@pytest.mark.parametrize(
+    "found", [lambda n: torch.zeros(n), lambda n: 1.0, lambda n: torch.ones(())]
+)
+def test_a_first_value_of_another_shape_is_refused(found):
+    field = tf.Field("v", "", shape=(3,), initial=lambda state, rows: found(len(rows)))
+    words = r"Field\('v'\)\.initial\(state, rows\) = .*a tensor of shape \(3, 3\)"
+    with pytest.raises(tf.InputError, match=words):
+        plain().bind(3).start().declare(field)

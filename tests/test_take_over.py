@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -187,3 +188,104 @@ def test_states_that_do_not_fit_are_refused(grown):
         tf.InputError, match=r"rules needs the field 'age'.*scene\.take_over\(state\)"
     ):
         tf.simulate(scene(tf.Rules(ageing, variables={"age": 0.0})), grown, until=3.0)
+
+
+def test_draws_go_by_seed_stream_and_id():
+    drawn = scene(division=tf.Division(added=tf.Normal(2.0, 0.4)))
+    state = tf.simulate(scene(), colonies=3, until=1.0, seed=7).last()
+    own = state.replace(stream=torch.tensor([4, 4, 9]))
+    made = drawn.take_over(own)
+    assert made.stream.tolist() == [4, 4, 9]
+    one, two, _ = (made.select([k]).division_threshold for k in range(3))
+    assert torch.equal(one, two)
+    some = drawn.take_over(own.select([2, 0]))
+    assert torch.equal(some.division_threshold, made.select([2, 0]).division_threshold)
+    other = drawn.take_over(own.replace(seed=8))
+    assert not torch.equal(other.division_threshold, made.division_threshold)
+
+
+def test_values_of_more_colonies_than_a_state_has():
+    wide = scene().replace(tf.Growth(rate=torch.tensor([1.0, 2.0, 3.0])), *scene().effects[1:])
+    few = tf.simulate(scene(), colonies=2, until=0.3).last()
+    made = wide.take_over(few)
+    assert made.colonies == 2 and tf.simulate(wide, made, until=0.4).last().colonies == 2
+    some = tf.simulate(scene(), colonies=3, until=0.3).last().select([1, 0])
+    assert wide.take_over(some).own_colony_id.tolist() == [1, 0]
+    by_colony = scene(division=tf.Division(added=[1.0, 2.0]))
+    second = scene().bind(2).start().select([1])
+    assert by_colony.take_over(second).division_threshold.tolist() == [2.0]
+
+
+def test_no_state_within_a_step_and_no_events_of_the_last_one():
+    state, model = scene().bind().start(), scene().bind()
+    with pytest.raises(tf.InputError, match="between two steps"):
+        scene().take_over(state.replace(span=(0.0, DT)))
+    while not state.births:
+        state = model.step(state)
+    made = scene().take_over(state)
+    assert made.births == made.ended == () and not made.reports
+
+
+def test_a_medium_with_fewer_signals_is_another():
+    two = scene(tf.Medium(food=tf.Signal(10.0), ahl=tf.Signal(5.0), **BOX)).bind().start()
+    with pytest.raises(tf.InputError, match=r"a medium of ahl, food.*of the scene, of food"):
+        scene(MEDIUM).take_over(two)
+
+
+def test_cells_beyond_a_medium_that_others_grew_without_are_refused():
+    small = scene(tf.Medium(food=tf.Signal(10.0, initial=1.0), box=((-6, -6), (6, 6)), spacing=2.0))
+    begun = tf.simulate(small, until=1.0).last()
+    beyond = tf.simulate(scene(), scene().take_over(begun), until=5.0).last()
+    with pytest.raises(tf.InputError, match=r"Medium\.box, from .* is too small for colony 0"):
+        small.take_over(beyond)
+
+
+@pytest.mark.parametrize("begun", [False, True], ids=["new medium", "medium of the state"])
+def test_a_growing_medium_reaches_the_cells(begun):
+    box = {"box": ((-2.0, -2.0), (2.0, 2.0)), "spacing": 1.0, "outside": "grow"}
+    growing = scene(tf.Medium(food=tf.Signal(10.0, initial=1.0), **box))
+    state = tf.simulate(growing, until=0.1).last() if begun else None
+    state = state if state is None else scene().take_over(state)
+    later = tf.simulate(scene(), state, until=4.0).last()
+    made = growing.take_over(later)
+    low = torch.as_tensor(made.layout.grid.origin)[0, :2]
+    high = low + torch.as_tensor(made.layout.grid.shape)[0, :2]
+    assert (made.layout.grid.shape[0, :2] > 4).all()
+    assert (later.position > low).all() and (later.position < high).all()
+    assert tf.simulate(growing, made, until=4.2).last().time == pytest.approx(4.2)
+
+
+def test_a_state_without_cells():
+    none = scene().bind().start().take(torch.arange(0))
+    made = OTHER.take_over(none)
+    assert made.cells == 0 and made.age.numel() == made.rfp.numel() == 0
+
+
+@pytest.mark.parametrize("change", [{"unit": "nm"}, {"dtype": torch.int64}, {"shape": (2,)}])
+def test_what_differs_by_unit_type_or_shape_begins_anew(change):
+    new = scene(tf.Rules(lambda cells: None, variables={"mark": 0.5}))
+    field = replace(new.bind().start().declared["mark"], initial=1, **change)
+    made = new.take_over(scene().bind().start().declare(field))
+    assert made.mark.dtype == torch.float32 and made.mark.tolist() == [0.5]
+
+
+@dataclass(frozen=True, eq=False)
+class Refusing(tf.Effect):
+    title, stage = "refusing", 5.0
+
+    def declares(self, dim):
+        return (tf.Field("dose", "a dose"),)
+
+    def reads(self):
+        return ("dose",)
+
+    def step(self, state, dt, values):
+        return state
+
+    def check(self, state, values):
+        raise tf.InputError("no such first state")
+
+
+def test_an_effect_that_is_new_looks_at_the_state():
+    with pytest.raises(tf.InputError, match="no such first state"):
+        scene(Refusing()).take_over(scene().bind().start())

@@ -106,3 +106,16 @@ def test_cells_of_each_type_are_counted_apart(tmp_path):
         tf.pictures.time_course(path, by="length")
     with pytest.raises(tf.InputError, match=r"one of .*cell_type"):
         tf.pictures.time_course(path, by="cell_typ")
+
+
+def test_bands_are_of_the_middle_cells_and_few_counts_are_even(tmp_path):
+    """Four colonies of eleven cells at rest, as long as 0, 1, …, 10 µm."""
+    path, size = tmp_path / "run.h5", range(11)
+    cells = tf.Cells([[3.0 * k, 0.0] for k in size], [1.0, 0.0], [float(k) for k in size])
+    scene = tf.Scene(tf.Growth(rate=0.0), founders=cells, dim=2, dt=0.1)
+    record = tf.Recorder(path, scene, every=1)
+    tf.simulate(scene, colonies=4, until=0.3, record=record).last()
+    counts, lengths = tf.pictures.time_course(path, "length").figure.axes
+    assert len(lengths.collections) == 4 and counts.get_yscale() == "linear"
+    band = lengths.collections[0].get_paths()[0].vertices[:, 1]
+    assert (band.min(), band.max()) == pytest.approx((1.0, 9.0))

@@ -125,8 +125,8 @@ def taken_over(scene: Scene, state: State) -> State:
     # names that rules are the first to set
     model.trace(model.opened(made, 0.0) if made.cells else None)
     own = lambda e: {f.name for f in e.declares()}
-    begun = media if state.layout is None else []
-    strange = [e for e in model.effects if e in begun or not new.isdisjoint(own(e))]
+    # cells may be beyond a medium that others have grown without
+    strange = [e for e in model.effects if e in media or not new.isdisjoint(own(e))]
     for effect in model.effects:
         if effect in strange or isinstance(effect, BoundRules | BoundCircuit):
             made = effect.ready(made)

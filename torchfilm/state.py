@@ -60,11 +60,11 @@ class Field(metaclass=checks.KnownKeywords):
 
     def start(self, state: State, rows: Tensor) -> Tensor:
         """Initial values for the given rows (M,) of the state: (M, *shape)."""
-        dtype = self.dtype or state.dtype
-        if callable(self.initial):
-            return self.initial(state, rows).to(dtype)
-        shape = rows.numel(), *self.shape
-        return torch.full(shape, self.initial, dtype=dtype, device=state.device)
+        dtype, shape = self.dtype or state.dtype, (rows.numel(), *self.shape)
+        if not callable(self.initial):
+            return torch.full(shape, self.initial, dtype=dtype, device=state.device)
+        found = row_checks.first_values(self.name, self.initial(state, rows), shape)
+        return found.to(dtype)
 
 
 @dataclass(frozen=True)
@@ -284,9 +284,6 @@ class State:
             )
         rows = self._rows[field.scope]
         start = field.start(declared, torch.arange(rows, device=self.device))
-        if start.shape[0] != rows:
-            what = f"initial value of {field.name}"
-            raise checks.input_error(what, tuple(start.shape), f"of {rows} rows")
         start = start.detach() if tangents.graph_is_dead(start) else start
         return declared.with_fields(**{field.name: start})
 

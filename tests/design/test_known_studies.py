@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from searching import Level, lit
+from searching import Level, fragile, lit
 
 import torchfilm as tf
-from design import CMAES, Bayesian, Finals, Parameter, Search, Sobol, Spread, Study
+from design import CMAES, Bayesian, Choice, Finals, Parameter, Racing, Search, Sobol, Spread, Study
 
 MAKE = [Parameter("make", 0.1, 10.0, log=True)]
 
 
-def search(parameters=MAKE, **options):
+def search(parameters=MAKE, scene=lit, **options):
     options = {
         "method": Sobol(batch=3), "cells": 3, "replicates": 2, "finals": None, **options
     }  # fmt: skip
-    return Search(lit, parameters, Level(wanted=1.0), **options)
+    return Search(scene, parameters, Level(wanted=1.0), **options)
 
 
 def ran(colonies, study=None, **options):
@@ -201,3 +201,71 @@ def test_a_remark_counts_what_is_grown_again(capsys):
     ran(12, start=[one.study, one.study])
     said = capsys.readouterr().err
     assert said.count("are grown again") == 1 and "so its 4 best designs are grown again" in said
+
+
+def test_failures_stay_with_their_designs():
+    old = search([Parameter("make", 1.0, 10.0)], fragile)
+    old.run(16, progress=False)
+    of = lambda study: [
+        sorted((replicate, words) for (k, replicate), words in e.reasons.items() if k == row)
+        for e in study.entries
+        for row in range(len(e.points))
+    ]
+    assert any(of(old.study)) and not all(of(old.study))
+    made = search([Parameter("make", 1.0, 20.0)], fragile, start=old.study)
+    assert made.study.entries[0].copies == 0 and of(made.study) == of(old.study)
+    assert made.study.failed == old.study.failed
+
+
+def test_what_holds_goes_before_what_does_not():
+    holds = ran(8, method=Sobol(batch=4))
+    other = ran(8, method=Sobol(batch=4), seed=3, method_seed=0)
+    assert np.array_equal(points_of(holds.study), points_of(other.study))
+    for start in ([holds.study, other.study], [other.study, holds.study]):
+        made = search(start=start)
+        assert len(made.study.entries[0].points) == 4 and len(made._known.points) == 0
+
+
+def test_a_search_with_other_options_is_another(tmp_path):
+    ran(8, study=tmp_path / "s.h5")
+    for more in ({"method_seed": 5}, {"start": {"make": 1.0}}):
+        with pytest.raises(tf.InputError, match="another search"):
+            search(**more).run(16, study=tmp_path / "s.h5", progress=False)
+
+
+def test_only_designs_at_full_size_are_known():
+    racing = Racing(inner=CMAES(population=4), sizes=(0.5, 1.0))
+    old = ran(20, method=racing, cells=4)
+    full = [x for e in old.study.full() for x in e.loss]
+    assert 0 < len(full) < sum(len(e.points) for e in old.study.entries)
+    made = search(cells=4, start=old.study)
+    assert sorted(made.study.entries[0].loss) == sorted(full)
+
+
+def alone(values):
+    return {**values, "second": "none" if values["first"] == "much" else values["second"]}
+
+
+def pair(first="little", second="none", decay=1.0):
+    return lit({"little": 1.0, "much": 3.0}[first] + {"none": 0.0, "some": 0.5}[second], decay)
+
+
+def test_choices_that_are_resolved_keep_their_losses():
+    kinds = [
+        Choice(name, options, resolve=alone)
+        for name, options in (("first", ("little", "much")), ("second", ("none", "some")))
+    ]
+    old = search([*kinds, Parameter("decay", 0.8, 1.2)], pair)
+    old.run(8, progress=False)
+    made = search([*kinds, Parameter("decay", 0.5, 2.0)], pair, start=old.study)
+    assert made._known.why == "" and made.study.entries[0].copies == 0
+
+
+@pytest.mark.parametrize("number", [1.5, np.float64(1.5), np.float32(1.5), np.int64(2)])
+def test_a_fixed_number_may_be_of_numpy(number):
+    """A study had it as a text that is none of a number, and the default was taken."""
+    old = ran(6, fixed={"decay": number})
+    made = search([*MAKE, Parameter("decay", 0.5, 2.0)], start=old.study)
+    known = made.study.entries[0]
+    assert known.copies == 0 and {v["decay"] for v in known.values} == {float(number)}
+    assert np.array_equal(known.loss, np.concatenate([e.loss for e in old.study.entries]))

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import dataclass, field
 from functools import partial
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -258,3 +262,116 @@ def test_what_a_class_holds_counts():
 
     assert digest(made(0)) == digest(made(0)) != digest(made(1))
     assert len(networks(made(0))) == 1
+
+
+def of_user(code, name="f"):
+    names = {"__name__": "of_a_user"}
+    exec(code, names)
+    return names[name]
+
+
+def of_class(body):
+    return of_user(f"class Own:\n  {body}\n", "Own")()
+
+
+CACHING = "import functools\n@functools.cache\ndef g(x): return x + {}\ndef f(x): return g(x)"
+WITHIN = "import math\ndef f(x): return [math.{}(y) for y in x]"
+HOLDING = (
+    "import numpy as np, types, collections, decimal, fractions, functools\n"
+    "K = {}\ndef f(x): return x, K"
+)
+KINDS = (
+    "np.float32({})", "np.int64({})", "complex({})", "bytes({})", "{{{}}}", "frozenset([{}])",
+    "range({})", "types.SimpleNamespace(k={})", "types.MappingProxyType(dict(k={}))",
+    "collections.deque([{}])", "decimal.Decimal({})", "fractions.Fraction({})",
+    "functools.partial(max, {})", "np.array([{}, None], dtype=object)",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "code, one, other",
+    [
+        ("def f(x, *, k={}): return x + k", 1, 2),
+        ("K = {}\ndef f(x): return [y + K for y in x]", 1.0, 2.0),
+        (WITHIN, "sin", "cos"),
+        (CACHING, 1, 2),
+        *((HOLDING, kind.format(1), kind.format(2)) for kind in KINDS),
+    ],
+)
+def test_what_a_function_uses_counts(code, one, other):
+    first, again, second = (digest(of_user(code.format(x))) for x in (one, one, other))
+    assert first == again != second
+
+
+def test_an_object_in_another_module_of_the_user_counts(monkeypatch):
+    """As the functions that are there do."""
+    found = []
+    for size in (1, 1, 2):
+        other = ModuleType("settings_of_a_user")
+        lines = f"class Box: size = 0\nbox = Box()\nbox.size = {size}"
+        exec(lines, vars(other))
+        monkeypatch.setitem(sys.modules, "settings_of_a_user", other)
+        function = of_user("from settings_of_a_user import box\ndef f(x): return x + box.size")
+        found.append(digest(function))
+    assert found[0] == found[1] != found[2]
+
+
+@pytest.mark.parametrize(
+    "plain, told",
+    [
+        ("def f(x):\n  x.age = x.age + 1", "def f(x):\n  'Ages.'\n  x.age = x.age + 1"),
+        ("def f(x): return None, 1, x", "def f(x):\n  '''Three.'''\n  return None, 1, x"),
+        (
+            "def f(x):\n  def g(y): y.age = 1.5\n  return g(x)",
+            "def f(x):\n  def g(y):\n    'Sets.'\n    y.age = 1.5\n  return g(x)",
+        ),
+    ],
+)
+def test_a_new_docstring_changes_nothing(plain, told):
+    assert digest(of_user(plain)) == digest(of_user(told))
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "size = property(lambda self: 1, lambda self, x: x + {})",
+        "k = classmethod(lambda kind: {})",
+        "k = staticmethod(lambda: {})",
+        "k = {}",
+    ],
+)
+def test_what_a_class_holds_counts_but_for_private_values(body):
+    one, again, other = (digest(of_class(body.format(k))) for k in (1, 1, 2))
+    assert one == again != other
+    assert digest(of_class("_seen = 1")) == digest(of_class("_seen = 2"))
+
+
+def test_keywords_of_a_partial_function_count():
+    base = of_user("def f(x, k): return x + k")
+    assert digest(partial(base, k=1)) != digest(partial(base, k=2))
+
+
+def test_arrays_count_by_what_they_hold():
+    a = np.arange(6.0).reshape(2, 3)
+    assert digest(np.asfortranarray(a)) == digest(a) and digest(a.T) == digest(a.T.copy())
+    assert digest(a) != digest(a[:, ::-1])
+    text = "x" * int("3")  # an object of its own
+    assert digest(np.array(["xxx", None])) == digest(np.array([text, None]))
+    assert digest(np.array(["xxx", None])) != digest(np.array(["xxy", None]))
+    assert digest(1.5) == digest(np.float64(1.5)) == digest(np.float32(1.5))
+
+
+def test_sets_are_alike_in_every_process():
+    code = (
+        "from torchfilm.tools.hashing import digest\n"
+        "def f(x): return x in {'a', 'bc', 'd', 'ef', 'g'}\n"
+        "print(digest(f, {'a', 'bc', 'd', 'ef', 'g'}))"
+    )
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", code], env={**os.environ, "PYTHONHASHSEED": seed},
+            capture_output=True, text=True, check=True,
+        ).stdout
+        for seed in "12"
+    }  # fmt: skip
+    assert len(found) == 1

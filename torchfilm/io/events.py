@@ -132,6 +132,12 @@ def check_course(before: State, state: State) -> None:
             " results have the same colonies: record what each colony does to a file of its own, or"
             " remove the cells of those that are done (state.remove)."
         )
+    if before.seed != state.seed or not torch.equal(before.stream, state.stream):
+        raise checks.InputError(
+            f"the run draws other random numbers at step {state.step} than before: its seed or its"
+            " streams were replaced. A file of results has one seed and one stream of each colony,"
+            " with which it is resumed: record what follows to a file of its own."
+        )
     made = sum(2 * b.parents.groups.counts for b in state.births)
     made = made + numbers_of(arrived_since(before, state), state)
     strange = state.next_uid != before.next_uid + made

@@ -31,7 +31,7 @@ which a frame adds a few rows, are not compressed: their chunks are written agai
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +110,16 @@ def grid_columns(state: State, first_voxel: int = 0) -> dict[str, np.ndarray]:
     }
 
 
+def all_columns(state: State) -> dict[str, dict[str, np.ndarray]]:
+    """The arrays of a frame by group and name."""
+    return {
+        "cells": cell_columns(state),
+        "frames/colony": colony_columns(state),
+        "signals": voxel_columns(state),
+        "frames/grid": grid_columns(state),
+    }
+
+
 def frame_bytes(state: State) -> int:
     """The size of the arrays of a frame, told by their shapes: nothing is copied from a GPU."""
     of_colonies = [v for n, v in state.fields.items() if state.declared[n].scope == COLONY]
@@ -170,21 +180,34 @@ def write_rows(table: h5py.Dataset, at: int, value: np.ndarray) -> None:
 
 
 def check_columns(
-    path: Path, columns: Mapping[str, np.ndarray], tables: Mapping[str, h5py.Dataset | None]
+    path: Path, given: Mapping[str, Mapping[str, np.ndarray]], part_of_file: Callable[[str], Any]
 ) -> None:
-    """Raise SimulationError for a column of cells that a file does not have, would round, or would
-    cut off."""
-    for name, value in columns.items():
-        if (table := tables[name]) is None:
+    """Raise SimulationError unless the columns of a state, by group and name, are those of a file,
+    which would else lack rows, round what it is given, or cut it off."""
+    for group, columns in given.items():
+        there = set(part_of_file(group) or ())
+        if new := sorted(columns.keys() - there):
             raise SimulationError(
-                f"the field {name!r} appeared during the run, after {path} was laid out: give it a"
-                " first value in Rules(…, variables=…) and start the run again."
+                f"{_noun(group)} {new[0]!r} appeared during the run, after {path} was laid out."
+                " Begin the run with it: rules have Rules(…, variables=…), states"
+                " state.declare(…)."
             )
-        if value.dtype != table.dtype:
+        if gone := sorted(there - columns.keys()):
             raise SimulationError(
-                f"the field {name!r} is of {value.dtype} now, and of {table.dtype} in {path}:"
-                f" convert what you set it to, value.to(torch.{table.dtype})."
+                f"{_noun(group)} {gone[0]!r} of {path} is gone from the state: all frames of a file"
+                " have the same columns. Record what follows to a file of its own."
             )
+        for name, value in columns.items():
+            table = part_of_file(f"{group}/{name}")
+            if value.dtype != table.dtype:
+                raise SimulationError(
+                    f"{_noun(group)} {name!r} is of {value.dtype} now, and of {table.dtype} in"
+                    f" {path}: convert what you set it to, value.to(torch.{table.dtype})."
+                )
+
+
+def _noun(group: str) -> str:
+    return {"signals": "the signal", "frames/grid": "the grid's"}.get(group, "the field")
 
 
 def next_chunk(table: h5py.Dataset, rows: int) -> int:

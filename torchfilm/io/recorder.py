@@ -21,9 +21,8 @@ from torchfilm.io.layout import (
     FRAME_COLUMNS,
     LINEAGE,
     VERSION,
-    cell_columns,
+    all_columns,
     check_columns,
-    colony_columns,
     create_framed,
     create_tables,
     found_columns,
@@ -31,7 +30,6 @@ from torchfilm.io.layout import (
     grid_columns,
     next_chunk,
     numpy_of,
-    voxel_columns,
     write_rows,
 )
 from torchfilm.io.parameters import write_parameters
@@ -309,11 +307,8 @@ class Recorder(metaclass=checks.KnownKeywords):
                 "state", "with other cells", f"of cells of the last frame of {self.path}",
                 "Record to a file of its own.",
             )  # fmt: skip
-        for scope, columns in (
-            ("cells", cell_columns), ("frames/colony", colony_columns),
-            ("signals", voxel_columns), ("frames/grid", grid_columns),
-        ):  # fmt: skip
-            recorded, own = set(kept.file.get(scope, ())), set(columns(state))
+        for scope, columns in all_columns(state).items():
+            recorded, own = set(kept.file.get(scope, ())), set(columns)
             if other := sorted(recorded ^ own):
                 has = "lacks" if other[0] in recorded else "has"
                 raise checks.input_error(
@@ -398,12 +393,12 @@ class Recorder(metaclass=checks.KnownKeywords):
             raise
 
     def _write_frame(self, file: h5py.File, state: State) -> None:
-        columns = cell_columns(state)
-        check_columns(self.path, columns, {n: self._table(f"cells/{n}") for n in columns})
+        columns = all_columns(state)
+        check_columns(self.path, columns, self._table)
         sizes = dict(self.sizes or committed(file))
         frame, first_voxel, voxels = sizes["frames"], 0, 0
         first_row = next_chunk(self._table("cells/uid"), sizes["rows"])
-        for name, value in columns.items():
+        for name, value in columns["cells"].items():
             self._append(f"cells/{name}", value, first_row)
         for name, value in found_columns(state).items():
             self._append(f"{AT_CELLS}/{name}", value, first_row)
@@ -414,9 +409,9 @@ class Recorder(metaclass=checks.KnownKeywords):
                 if self._table(f"lineage/{table}/{name}") is not None:  # older files lack some
                     self._append(f"lineage/{table}/{name}", value, sizes[table])
             sizes[table] += len(merged[0])
-        for name, value in colony_columns(state).items():
+        for name, value in columns["frames/colony"].items():
             self._append(f"frames/colony/{name}", value[None], frame)
-        for name, value in voxel_columns(state).items():
+        for name, value in columns["signals"].items():
             first_voxel = next_chunk(self._table(f"signals/{name}"), sizes["voxels"])
             voxels = first_voxel + len(value)
             self._append(f"signals/{name}", value, first_voxel)

@@ -7,11 +7,14 @@ import dis
 import hashlib
 import re
 import sys
+from collections import deque
 from collections.abc import Iterator, Mapping
+from decimal import Decimal
+from fractions import Fraction
 from functools import cache, partial
 from inspect import unwrap
 from pathlib import Path
-from types import CodeType, FunctionType, MethodType, ModuleType
+from types import CodeType, FunctionType, MethodType, ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,9 +32,9 @@ def digest(*things: Any) -> str:
 
     Lists and tuples count as equal if their items do, and floats of any precision if their values
     do. A function counts by its code, its defaults, its closure and the globals of its own module
-    that it uses, and so do the functions that these name in other modules of the user's, which are
-    all but Python's and those of installed packages. Its name, line numbers and docstring do not
-    count. An object of a user's class counts by its attributes, and by its class's methods,
+    that it uses, and so do the functions and values that it names in other modules of the user's,
+    which are all but Python's and those of installed packages. Its name, line numbers and docstring
+    do not count. An object of a user's class counts by its attributes, and by its class's methods,
     properties and plain values, but for names that begin with an underscore. A torch.nn module
     counts by its form and its weights, wherever it is defined. Classes that a function names do not
     count, nor what it imports as it runs. Different versions of Python may compile one function in
@@ -103,6 +106,10 @@ class _Word:
     def _add(self, thing: Any, enclosing: set[int]) -> None:
         if isinstance(thing, torch.Tensor):
             thing = _numbers_of(thing)
+        if isinstance(thing, np.generic):
+            thing = thing.item()
+        if isinstance(thing, np.ndarray) and thing.dtype.kind == "O":
+            thing = ["array of objects", thing.shape, *thing.ravel().tolist()]
         if isinstance(thing, np.ndarray):
             if thing.dtype.kind == "f":
                 # a number from a file equals the written number, in any precision
@@ -142,13 +149,8 @@ def _parts(thing: Any, *, weights: bool) -> list[Any]:
     """The parts of an object that count for its digest."""
     if isinstance(thing, FunctionType):
         closure = [c.cell_contents for c in thing.__closure__ or () if not _is_empty(c)]
-        code = thing.__code__
-        # its first constant may be its docstring, which has no effect
-        used = code.co_consts[1:] if code.co_consts[:1] == (thing.__doc__,) else code.co_consts
         return [
-            code.co_code,
-            code.co_names,
-            used,
+            thing.__code__,
             thing.__defaults__,
             thing.__kwdefaults__,
             *closure,
@@ -159,7 +161,7 @@ def _parts(thing: Any, *, weights: bool) -> list[Any]:
     if isinstance(thing, partial):
         return [thing.func, thing.args, thing.keywords]
     if isinstance(thing, CodeType):
-        return [thing.co_code, thing.co_names, thing.co_consts]
+        return _instructions(thing)
     if isinstance(thing, Mapping):
         return [x for key, value in thing.items() for x in (key, value)]
     if isinstance(thing, (tuple, list)):
@@ -190,8 +192,22 @@ def _parts(thing: Any, *, weights: bool) -> list[Any]:
     return [kind.__qualname__, *given, *(x for c in own for x in _of_class(c))]
 
 
+def _instructions(code: CodeType) -> list[Any]:
+    """What a code does: its instructions, with the constants that they load. A docstring is loaded
+    by none, but its place among the constants would change the others' numbers."""
+    found: list[Any] = []
+    of_values = {*dis.hasconst, *dis.hasname}
+    for i in dis.get_instructions(code):
+        if i.opname != "EXTENDED_ARG":
+            found += [i.opname, i.argval if i.opcode in of_values else i.arg]
+    return found
+
+
 # What counts as it is.
-PLAIN = (str, int, float, bool, tuple, list, dict, np.ndarray, torch.Tensor)
+PLAIN = (
+    str, bytes, int, float, complex, bool, tuple, list, set, frozenset, range, deque, Mapping,
+    Decimal, Fraction, SimpleNamespace, np.generic, np.ndarray, torch.Tensor, partial,
+)  # fmt: skip
 
 
 def _of_class(kind: type) -> list[Any]:
@@ -330,6 +346,7 @@ def _globals(function: FunctionType) -> list[Any]:
         or (isinstance(x, FunctionType) and mine(x))
         or isinstance(x, torch.nn.Module)
         or type(x).__module__ == function.__module__
+        or (_of_user(type(x).__module__) and not isinstance(x, (type, FunctionType)))
     ]
 
 

@@ -89,6 +89,15 @@ def check_declaration(name: Any, shape: Any, initial: Any) -> None:
         raise checks.input_error(f"Field({name!r}).initial", initial, rule)
 
 
+def first_values(name: str, found: Any, shape: tuple[int, ...]) -> Tensor:
+    """What the function `initial` of a field has returned. Raises InputError for another shape."""
+    if not isinstance(found, Tensor) or found.shape != shape:
+        given = tuple(found.shape) if isinstance(found, Tensor) else found
+        rule = f"a tensor of shape {shape}"
+        raise checks.input_error(f"Field({name!r}).initial(state, rows)", given, rule)
+    return found
+
+
 def check_declared(fields: Collection[str], declared: Collection[str]) -> None:
     """Raises InputError for a field that nothing declares."""
     for name in fields:
