@@ -1,14 +1,17 @@
-"""What cells of a type keep in fields of their own, and what becomes of it when a rule gives them
-another type."""
+"""What cells of a type keep in fields of their own, and what becomes of it when a rule or a user's
+effect gives them another type."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
 import torch
 
-from torchfilm.effect import BoundEffect
 from torchfilm.state import State
+
+if TYPE_CHECKING:
+    from torchfilm.effect import BoundEffect
 
 
 def kept_by_type(effects: Sequence[BoundEffect]) -> tuple[str, ...]:
@@ -30,7 +33,9 @@ def kept_by_type(effects: Sequence[BoundEffect]) -> tuple[str, ...]:
 def with_values_of_new_types(before: State, after: State, names: Iterable[str]) -> State:
     """`after`, with cells that were of another type in `before`, row by row, given the values of
     their new type in these fields, drawn anew where they are drawn; but for what has changed
-    itself."""
+    itself, and where cells have gone or come."""
+    if not torch.equal(before.uid, after.uid) or not torch.equal(before.colony, after.colony):
+        return after
     new_type = before.fields["cell_type"] != after.fields["cell_type"]
     changed = {}
     for name in names:

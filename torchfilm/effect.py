@@ -9,10 +9,10 @@ only through named fields.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Container, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial, wraps
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from torchfilm import own_step
@@ -95,7 +95,7 @@ class Effect(metaclass=checks.KnownKeywords):
         if own is None:
             return
 
-        @functools.wraps(own)
+        @wraps(own)
         def checked_first(self: Effect, *given: Any) -> None:
             Effect.__post_init__(self)
             own(self, *given)
@@ -288,6 +288,7 @@ class BoundEffect:
         self.effect, self.binding = effect, binding
         self.title, self.stage = effect.title, effect.stage
         self.place = 0  # of the effect in its scene
+        self.by_type: tuple[str, ...] = ()  # what cells keep by their type, see `kept_by_type`
         self.plan = ExchangePlan()
         self.values = Values(self._resolve(effect, binding.batch))
 
@@ -342,8 +343,7 @@ class BoundEffect:
         return state
 
     def trace(self, state: State) -> State:
-        """Find out, once, what can only be found by trying; the state made ready, as `ready`
-        does."""
+        """Find out, once, what can only be found by trying; the state as `ready` makes it."""
         return self.ready(state)
 
     def ready(self, state: State) -> State:
@@ -381,8 +381,8 @@ class BoundEffect:
         """The state after this effect has acted for dt hours."""
         if not is_own(self.effect):
             return self.effect.step(state, dt, self.values)
-        step = functools.partial(self.effect.step, state, dt, self.values)
-        return own_step.taken(type(self.effect).__name__, step, state, self.writes())
+        step, name = partial(self.effect.step, state, dt, self.values), type(self.effect).__name__
+        return own_step.taken(name, step, state, self.writes(), self.by_type)
 
     def run_step(self, state: State, dt: float, timings: Timings | None = None) -> State:
         """As `step`, with torch's `threads`, and timed."""

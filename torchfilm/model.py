@@ -21,6 +21,7 @@ import torch
 
 from torchfilm import binding_checks
 from torchfilm.arrivals import with_arrivals
+from torchfilm.cell_types import kept_by_type
 from torchfilm.cpu_parts import CpuTwins, OnCpu
 from torchfilm.effect import BUILT_IN, DIVISION, FLAGGED_DIVISION, Binding, BoundEffect, is_own
 from torchfilm.founders import FirstCells
@@ -187,8 +188,11 @@ class Model:
         tried = self._laid(self.begin) if state is None else state
         for effect in self.effects:
             tried = effect.trace(tried)
+        by_type = kept_by_type(self.effects)
         for effect in self.effects:  # now that it is known what rules write
             effect.check_others(self.effects)
+            if not is_own(effect.effect) or {"cell_type", "cells"} & {*effect.writes()}:
+                effect.by_type = by_type
         self.twins = CpuTwins.of_model(self, self.begin, tried)
         return tried
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Mapping
 
 from torch import Tensor
 
+from torchfilm.cell_types import with_values_of_new_types
 from torchfilm.state import PER_CELL, PER_COLONY, State
 from torchfilm.tools import checks
 from torchfilm.tools.deterministic_math import deterministic_functions
@@ -15,15 +16,20 @@ COLUMNS = (*PER_CELL, *PER_COLONY)
 
 
 def taken(
-    name: str, step: Callable[[], object], state: State, writes: Collection[str]
-) -> State:  # fmt: skip
+    name: str,
+    step: Callable[[], object],
+    state: State,
+    writes: Collection[str],
+    by_type: Collection[str],
+) -> State:
     """The state that an effect of this name makes of a state by `step()`, in which a colony's bits
-    do not depend on others where `deterministic_functions` covers what it calls. Raises as
-    `check_step`."""
+    do not depend on others where `deterministic_functions` covers what it calls. Cells that it
+    gives another type have that type's values of the fields `by_type`. Raises as `check_step`."""
     before = seen(state)
     with deterministic_functions():
         made = step()
-    return check_step(name, before, made, writes)
+    after = check_step(name, before, made, writes)
+    return with_values_of_new_types(state, after, by_type) if by_type else after
 
 
 def seen(state: State) -> dict[str, tuple[Tensor, int]]:

@@ -3,6 +3,7 @@ same bits whatever the batch."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from torchfilm.circuits.molecules import nearest
 from torchfilm.circuits.partition import binomial
 from torchfilm.rule_values import RuleError, as_tensor
 from torchfilm.state import State
+from torchfilm.tools import checks
 from torchfilm.tools.random import MASK, fine_uniform, uniform
 from torchfilm.tools.row_checks import check_rows, out_of_range
 
@@ -24,6 +26,8 @@ class Draws:
     _rows: Tensor | None
     _draws: int
     _purpose: str
+    # in a trial: what was given to chance, event, poisson and binomial, by the words for it
+    _asked: dict[str, Tensor] | None = None
 
     def random(self) -> Tensor:
         """A draw from (0, 1) for each cell, (N,), or each division, (M,), keyed by seed, colony,
@@ -46,14 +50,20 @@ class Draws:
         """Whether something of this probability happens to each cell, (N,), or at each division,
         (M,), bool. Of what happens at a rate, `cells.event(rate)` knows whether it does."""
         fine = self._fine()
-        return fine < _probability("chance", probability, fine)
+        return fine < self._noted("chance", _probability("chance", probability, fine))
 
     def poisson(self, mean: float | Tensor) -> Tensor:
         """How many independent events happen of which this `mean` is expected: one draw for each
         cell, (N,), or each division, (M,). New mutations, say, at a rate of 0.003 per hour:
         cells.mutations = cells.mutations + cells.poisson(0.003 * cells.dt)."""
         fine = self._fine()
-        return poisson(_at_least_zero("poisson", "mean", mean, fine), fine).to(self._state.dtype)
+        each = self._noted("poisson", _at_least_zero("poisson", "mean", mean, fine))
+        return poisson(each, fine).to(self._state.dtype)
+
+    def _noted(self, draw: str, given: Tensor) -> Tensor:
+        if self._asked is not None:
+            self._asked[f"what it gives to {draw}, draw {len(self._asked) + 1}"] = given
+        return given
 
     def _fine(self) -> Tensor:
         return fine_uniform(self.random(), self.random())
@@ -71,7 +81,8 @@ class Draws:
             raise RuleError(
                 f"binomial was given the number {float(wrong[0])}: it must be whole, 0 or more"
             )
-        return binomial(count, _probability("binomial", probability, drawn), drawn)
+        each = self._noted("binomial", _probability("binomial", probability, drawn))
+        return binomial(self._noted("binomial", count), each, drawn)
 
 
 class StepDraws(Draws):
@@ -79,11 +90,18 @@ class StepDraws(Draws):
 
     _dt: float
 
+    def every(self, hours: float) -> bool:
+        """Whether a multiple of so many hours lies in this step, from its beginning on, and before
+        its end. Raises InputError for less than a step."""
+        hours = checks.number("cells.every(hours)", hours, least=self._dt * (1.0 - 1e-6))
+        begin = self._state.time - 1e-6 * self._dt  # times are rounded
+        return math.ceil(begin / hours) * hours < begin + self._dt
+
     def event(self, rate: float | Tensor) -> Tensor:
         """Whether what happens at this rate, 1/h, does so in this step, to each cell, (N,) bool: of
         the probability 1 − exp(−rate · dt)."""
         fine = self._fine()
-        each = _at_least_zero("event", "rate", rate, fine)
+        each = self._noted("event", _at_least_zero("event", "rate", rate, fine))
         return fine < -torch.expm1(-each * self._dt)
 
     def contact_random(self, i: Tensor, j: Tensor) -> Tensor:

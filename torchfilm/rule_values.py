@@ -92,22 +92,23 @@ def broadcast_copy(name: str, tensor: Tensor, dtype: torch.dtype, shape: Sequenc
 
 
 def warn_of_mixing(rule: str, act: Callable[[State], Mapping[str, Tensor]], state: State) -> None:
-    """Warn where what a rule writes in one colony depends on another of the batch. act: the columns
-    that it writes."""
+    """Warn where what a rule does in one colony depends on another of the batch. act: the columns
+    that it sets, or draws by, by the words for them."""
     if state.colonies < 2 or not bool((state.counts[:2] > 0).all()):
         return
     if names := _mixed(act, state):
         warn(
-            f"{rule}: what it sets, {names[0]}, depends on the other colonies of the batch: alone a"
-            " colony would have another value. x.max() and x.mean() are over all cells of all"
-            " colonies; cells.colony_max(x) and cells.colony_sum(x) are over each cell's own."
+            f"{rule}: {names[0]}, depends on the other colonies of the batch: alone a colony would"
+            " have another value. x.max(), x.mean(), len(cells) and cells.count are over all cells"
+            " of all colonies; cells.colony_max(x), cells.colony_sum(x) and, for the number of"
+            " cells, cells.colony_sum(1.0) are over each cell's own."
         )
 
 
 @torch.no_grad()
 def _mixed(act: Callable[[State], Mapping[str, Tensor]], state: State) -> list[str]:
-    """The columns that a rule gives other numbers in a colony alone than beside another one, whose
-    numbers are changed. Nothing where it fails, or where its numbers differ from call to call."""
+    """The words for columns that have other numbers in a colony alone than beside another one,
+    whose numbers are changed. Nothing where it fails, or where numbers differ between calls."""
     one, two = state.select([0]), state.select([0, 1])
     mine, cells = two.colony == 0, two.fields
     other = {
@@ -122,6 +123,6 @@ def _mixed(act: Callable[[State], Mapping[str, Tensor]], state: State) -> list[s
     except Exception:  # numbers that the rule does not expect
         return []
     alike = lambda a, b: torch.allclose(a.double(), b.double(), 1e-5, equal_nan=True)
-    if not all(alike(x, again[n]) for n, x in alone.items()):
+    if not all(n in again and alike(x, again[n]) for n, x in alone.items()):
         return []
-    return [n for n, x in alone.items() if not alike(x, beside[n][mine])]
+    return [n for n, x in alone.items() if n in beside and not alike(x, beside[n][mine])]

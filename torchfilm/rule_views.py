@@ -111,6 +111,7 @@ class CellsView(StepDraws, Surroundings):
         self.__dict__.update(
             _state=state, _rows=None, _purpose=label, _dt=dt, _work={}, _read=set(), _shown={},
             _given={}, _around=None, _written=set(), _declaring=declaring, _draws=0, _draws_of={},
+            _asked={} if declaring else None,
             _pairs={}, _constants=constants,
         )  # fmt: skip
 

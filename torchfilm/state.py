@@ -320,7 +320,7 @@ class State:
                 changed[name] = value.index_fill(0, daughters, first)
         return self.with_fields(**changed)
 
-    def remove(self, gone: Tensor, fate: str) -> State:
+    def remove(self, gone: Tensor, fate: str = "removed") -> State:
         """The state without the cells where `gone` (N,) is true, whose end is noted. fate: one of
         `FATES`; of cells that go between two steps of a run, a recording knows that they went, and
         calls them removed."""
@@ -379,22 +379,16 @@ class State:
     def uniform(self, rows: Tensor, purpose: str) -> Tensor:
         """A draw from (0, 1) for each of the given cells (M,), the same whatever the batch: keyed
         by seed, stream, uid, step, purpose."""
-        return self._drawn(random.uniform, rows, purpose)
+        return state_colonies.drawn(self, random.uniform, rows, purpose)
 
     def normal(self, rows: Tensor, purpose: str) -> Tensor:
         """Four standard normal draws for each of the given cells, (M, 4), keyed as `uniform`."""
-        return self._drawn(random.normal, rows, purpose)
+        return state_colonies.drawn(self, random.normal, rows, purpose)
 
-    def _drawn(self, law: Callable[..., Tensor], rows: Tensor, purpose: str) -> Tensor:
-        row_checks.check_rows("rows", rows, self.cells)
-        if not isinstance(purpose, str):
-            raise checks.input_error("purpose", purpose, "a text")
-        try:
-            stream = self.stream.index_select(0, self.colony.index_select(0, rows))
-            uid = self.uid.index_select(0, rows)
-        except IndexError as error:
-            raise row_checks.out_of_range("rows", rows, self.cells) from error
-        return law(self.seed, stream, uid, self.step, purpose, self.dtype)
+    def sample_cells(self, count: int, purpose: str = "sample") -> Tensor:
+        """`count` cells of each colony at random, none twice, or all of a colony that has no more:
+        (N,) bool. Keyed as `uniform`; draws of one step differ by their purposes."""
+        return state_colonies.sampled(self, count, purpose)
 
     def _own_fields(self) -> list[str]:
         """The fields but those that serve the numerics."""

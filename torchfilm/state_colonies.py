@@ -1,4 +1,5 @@
-"""Colonies of a state as wholes: some of them taken out, or put in the place of others."""
+"""Colonies of a state as wholes, some of them taken out or put in the place of others; and what
+their cells draw."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchfilm.tools import checks, displays, row_checks
+from torchfilm.tools import checks, displays, random, row_checks
 from torchfilm.tools.ragged import offsets
 from torchfilm.tools.threads import one_torch_thread
 
@@ -54,6 +55,32 @@ def note_of(state: State, rows: Tensor, fate: str) -> Ended:
     uid, length = (x.index_select(0, rows) for x in (state.uid, state.length))
     kind = state.fields.get("cell_type")
     return Ended(fate, colony, uid, length, None if kind is None else kind.index_select(0, rows))
+
+
+def drawn(state: State, law: Callable[..., Tensor], rows: Tensor, purpose: str) -> Tensor:
+    """See `State.uniform`. law: of `torchfilm.tools.random`."""
+    row_checks.check_rows("rows", rows, state.cells)
+    if not isinstance(purpose, str):
+        raise checks.input_error("purpose", purpose, "a text")
+    try:
+        stream = state.stream.index_select(0, state.colony.index_select(0, rows))
+        uid = state.uid.index_select(0, rows)
+    except IndexError as error:
+        raise row_checks.out_of_range("rows", rows, state.cells) from error
+    return law(state.seed, stream, uid, state.step, purpose, state.dtype)
+
+
+def sampled(state: State, count: int, purpose: str) -> Tensor:
+    """See `State.sample_cells`."""
+    count = checks.integer("sample_cells(count)", count, least=0)
+    every = torch.arange(state.cells, device=state.device)
+    # two draws, since one has values that repeat among many cells
+    coarse, fine = (drawn(state, random.uniform, every, f"{purpose} {k}") for k in (0, 1))
+    order = torch.argsort(random.fine_uniform(coarse, fine), stable=True)
+    order = order[torch.argsort(state.colony[order], stable=True)]
+    first = state.counts.cumsum(0) - state.counts
+    rank = every - first[state.colony[order]]
+    return torch.zeros_like(every, dtype=torch.bool).index_copy(0, order, rank < count)
 
 
 def selected(state: State, places: Tensor) -> State:

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.cell_types import kept_by_type, with_values_of_new_types
+from torchfilm.cell_types import with_values_of_new_types
 from torchfilm.circuits.names import Names
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.rule_values import RuleError, warn_of_mixing
@@ -84,7 +84,6 @@ class BoundRule(BoundEffect):
         self.shared = {n for n, title in binding.declared.items() if title != effect.title}
         self.types: dict[str, tuple[int, ...]] = {}
         self.least_zero: set[str] = set()
-        self.by_type: tuple[str, ...] = ()
 
     def writes(self) -> tuple[str, ...]:
         return self.traced_writes
@@ -110,7 +109,6 @@ class BoundRule(BoundEffect):
         self.others = effects
         self.types = {n: t for e in effects for n, t in e.typed_values().items()}
         self.least_zero = {n for e in effects for n in e.effect.at_least_zero()}
-        self.by_type = kept_by_type(effects)
 
     def label(self, rule: Callable[..., None], name: str) -> str:
         """A label that gives this rule, the "update" or "divide" of its effect, random numbers of
@@ -284,11 +282,11 @@ class BoundRules(BoundRule):
         return state
 
     def _columns(self, update: Callable[[CellsView], None], state: State) -> dict[str, Tensor]:
-        """What a rule writes in a trial."""
+        """What a rule writes in a trial, and gives to what it draws, by the words for it."""
         constants = self.constants(state)
         view = CellsView(state, TRIAL_STEP, label_of(update), declaring=True, constants=constants)
         act(update, view)
-        return dict(view._work)
+        return {f"what it sets, {n}": x for n, x in view._work.items()} | (view._asked or {})
 
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0:

@@ -164,8 +164,15 @@ class Growth(Effect):
 
     def check_scene(self, effects: Sequence[Effect], founders: Any) -> None:
         redrawn = self.rate is not None and is_drawn(self.rate) and not is_inherited(self.rate)
-        kept = "growth_rate" in founders.extra and not self.by_type and not redrawn
-        if kept and self.rate is not None and bool(numbers(self.rate).any()):
+        own = "growth_rate" in founders.extra and self.rate is not None
+        if own and self.by_type and not redrawn:
+            warn(
+                f"the first cells have a growth_rate of their own, which Growth.rate ="
+                f" {self.rate!r} replaces by that of their types. Leave theirs out, or write"
+                " Growth()."
+            )
+        kept = own and not self.by_type and not redrawn
+        if kept and bool(numbers(self.rate).any()):
             warn(
                 f"Growth.rate = {self.rate!r} has no effect: the first cells have a growth_rate of"
                 " their own, which their descendants keep. Write Growth(), or leave theirs out"

@@ -25,8 +25,9 @@ PLAIN = (*AXIS, "cell_type", "colony")
 LABELS = ("label", "id", "cell_id", "track_id", "track")
 FRAMES = ("frame",)
 ROWS = ("index", "", "unnamed: 0")
-# What tables of torchfilm's results have besides: it follows from other columns, or from the run.
-OF_RESULTS = ("time", "cell", "parent", "volume", "age", "born")
+# What tables of torchfilm's states and results have besides: it follows from other columns, or from
+# the run.
+OF_STATES, OF_RESULTS = ("time", "cell", "parent", "volume"), ("age", "born")
 # angles from which on too few are within a quarter turn for it to be chance
 ENOUGH = 8
 
@@ -382,8 +383,8 @@ def _fields(table: Table, reading: Reading, used: set[str]) -> dict[str, np.ndar
         return {}
     numbering = (*LABELS, *FRAMES, *ROWS)
     left = [n for n in table.columns if n not in used and n.lower() not in numbering]
-    if all(n in table.columns for n in OF_RESULTS):  # signals outside have dots
-        left = [n for n in left if n not in OF_RESULTS and n.isidentifier()]
+    if all(n in table.columns for n in OF_STATES):  # signals outside have dots
+        left = [n for n in left if n not in OF_STATES + OF_RESULTS and n.isidentifier()]
     return {name: table.numbers(name, optional=True) for name in left}
 
 

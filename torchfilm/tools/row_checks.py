@@ -144,6 +144,7 @@ def check_geometry(columns: Mapping[str, Any], colonies: int, dim: int, dtype: A
         if bool(wrong.any()):
             k = int(torch.nonzero(wrong)[0])
             raise checks.input_error(f"state.{name}[{k}]", columns[name][k].item(), rule)
+    _check_numbers(colony, columns["uid"])
 
 
 def checked_tensors(
@@ -202,6 +203,22 @@ def _of_kind(name: str, value: Tensor, dtype: torch.dtype) -> Tensor:
         lost = value[tuple(at.tolist())].item()
         raise checks.input_error(f"the field {name!r}", lost, f"a number that {dtype} can hold")
     return made
+
+
+def _check_numbers(colony: Tensor, uid: Tensor) -> None:
+    """Raises InputError for two cells of a colony with one number, by which they draw."""
+    order = torch.argsort(uid, stable=True)
+    order = order[torch.argsort(colony[order], stable=True)]
+    twice = (uid[order].diff() == 0) & (colony[order].diff() == 0)
+    if bool(twice.any()):
+        k = int(torch.nonzero(twice)[0])
+        one, other = sorted(order[k : k + 2].tolist())
+        raise checks.InputError(
+            f"cells {one} and {other} have one uid, {int(uid[one])}, in one colony, as after"
+            " state.take with an index twice: all their random numbers would be the same. Give"
+            " copies numbers of their own: state.replace(uid=…, next_uid=…), next_uid above all of"
+            " them."
+        )
 
 
 def warn_of_rounding(name: str, values: np.ndarray, dtype: torch.dtype) -> None:
