@@ -203,6 +203,7 @@ def kept(before: tf.State, after: tf.State, draw: Draw) -> None:
         or eats(draw)
         or draw.beside.leaving
         or draw.beside.rule == "remove"
+        or (draw.beside.bursting and o is None)  # without a medium what they hold is lost
     ):
         return
     if o is not None and (

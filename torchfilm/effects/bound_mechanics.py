@@ -26,6 +26,7 @@ from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.tangents import has_tangent, in_forward_mode
+from torchfilm.tools.warn_once import warn
 from torchfilm.values import is_drawn, numbers
 
 if TYPE_CHECKING:
@@ -80,9 +81,10 @@ class BoundMechanics(BoundEffect):
         self.drifts = any("drift" in effect.writes() for effect in effects)
 
     def check_given(self, state: State, free: Container[str]) -> None:
-        """Soft walls may have given way by more than a cell's radius."""
+        # soft walls give way, and a step in which cells grow manifold may leave one behind a hard one
         hard = (s for s in self.effect.surfaces() if s.wall.stiffness is None)
-        self.effect.check_behind(state, hard)
+        if wrong := self.effect.behind(state, hard):
+            warn(f"{wrong} Contacts push it back, and others aside.")
 
     def _check_precision(self) -> None:
         """Raise InputError for forces that are wanted more exactly than the states' numbers are."""

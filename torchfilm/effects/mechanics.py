@@ -280,7 +280,8 @@ class Mechanics(Effect):
             )  # fmt: skip
         for kind in self.adhesion:
             check_variables("Adhesion", state, adhesin=kind.adhesin, partner=kind.partner)
-        self.check_behind(state, self.surfaces())
+        if wrong := self.behind(state, self.surfaces()):
+            raise checks.InputError(wrong)
         cells, ids = (state.position, state.axis, state.length, state.radius), state.own_colony_id
         check_room(self.surfaces(), state.position, state.radius, ids)
         if check_fits(self.surfaces(), state.position, *cells[2:], ids, state.uid):
@@ -288,20 +289,21 @@ class Mechanics(Effect):
         check_apart(*cells, state.colony, state.colony_id, state.uid, space)
 
     @staticmethod
-    def check_behind(state: State, surfaces: Iterable[Surface]) -> None:
-        """Raise InputError for a cell whose centre lies behind a wall."""
+    def behind(state: State, surfaces: Iterable[Surface]) -> str:
+        """The words for a cell whose centre lies behind a wall; "" where there is none."""
         for surface in surfaces:
             distance, _ = surface.gap_of_points(state.position, state.own_colony_id)
             behind = torch.nonzero(distance < 0).squeeze(1)
             if behind.numel():
                 k = int(behind[0])
-                raise checks.InputError(
+                return (
                     f"{type(surface.wall).__name__}: cell {int(state.uid[k])} of colony"
                     f" {int(state.own_colony_id[k])} starts at"
                     f" {[round(x, 3) for x in state.position[k].tolist()]},"
                     f" {-float(distance[k]):.3g} µm behind it (cells behind it: {behind.numel()})."
                     f" {surface.wall.turn_hint}"
                 )
+        return ""
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         return (BoundMechanics(self, binding),)
