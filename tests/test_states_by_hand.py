@@ -177,7 +177,7 @@ def test_cells_behind_a_wall_are_remarked_on_where_a_run_goes_on():
 def test_a_run_goes_on_after_a_step_that_left_a_cell_behind_a_wall():
     """Cells that grow tenfold in a step may; found by the fuzzer."""
     made = tf.Scene(
-        tf.Growth(rate=300.0), tf.Mechanics(dim=2, walls=[tf.Plane(y=0.0, facing="+y")]),
+        tf.Growth(rate=100.0), tf.Mechanics(dim=2, walls=[tf.Plane(y=0.0, facing="+y")]),
         founders=tf.Cells([[0.0, 0.6], [0.4, 2.0]], [[1.0, 0.0], [0.0, 1.0]], length=2.0), dt=0.01,
     )  # fmt: skip
     state = tf.simulate(made, until=0.01).last()

@@ -81,7 +81,7 @@ class BoundMechanics(BoundEffect):
         self.drifts = any("drift" in effect.writes() for effect in effects)
 
     def check_given(self, state: State, free: Container[str]) -> None:
-        # soft walls give way, and a step in which cells grow manifold may leave one behind a hard one
+        # soft walls give way; a step in which cells grow manifold may leave one behind a hard one
         hard = (s for s in self.effect.surfaces() if s.wall.stiffness is None)
         if wrong := self.effect.behind(state, hard):
             warn(f"{wrong} Contacts push it back, and others aside.")
