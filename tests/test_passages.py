@@ -85,18 +85,22 @@ class Changing(tf.Effect):
 
     def step(self, state, dt, values):
         kind = torch.where((state.uid % 2 == 0) & (state.time > 0.5), 1, state.cell_type)
-        return state.with_fields(cell_type=kind)
+        made = state.with_fields(cell_type=kind)
+        gone = (state.uid < 5) & (state.time > 0.5)
+        return made.remove(gone) if self.removing else made
 
 
-def test_cells_to_which_an_effect_of_ones_own_gives_a_type_have_its_values():
+@pytest.mark.parametrize("removing", [False, True])
+def test_cells_to_which_an_effect_of_ones_own_gives_a_type_have_its_values(removing):
     """As by rules; they had kept what was drawn for their old type."""
     cells = far_apart(20, cell_type=[0] * 20)
-    scene = tf.Scene(Changing(), tf.Growth(rate=RATE), dim=2, dt=0.05, founders=cells)
+    scene = tf.Scene(Changing(removing), tf.Growth(rate=RATE), dim=2, dt=0.05, founders=cells)
     first = scene.bind(seed=3).start()
     last = tf.simulate(scene, first, until=1.0).last()
-    changed = last.cell_type == 1
-    assert int(changed.sum()) == 10 and (last.growth_rate[changed] - 3.0).abs().max() < 0.3
-    assert torch.equal(last.growth_rate[~changed], first.growth_rate[~changed])
+    changed, gone = last.cell_type == 1, 5 if removing else 0
+    assert int(changed.sum()) == (7 if removing else 10) and last.cells == 20 - gone
+    assert (last.growth_rate[changed] - 3.0).abs().max() < 0.3
+    assert torch.equal(last.growth_rate[~changed], first.growth_rate[gone:][~changed])
     again = tf.simulate(scene, last, until=1.5).last()
     assert torch.equal(again.growth_rate, last.growth_rate)  # drawn once
 
