@@ -99,6 +99,16 @@ def test_a_threshold_of_another_kind_is_refused_without(kinds):
     assert tf.simulate(other, other.take_over(state), until=1.0).last().time == pytest.approx(1.0)
 
 
+def test_a_variable_of_rules_may_become_a_species():
+    with_rule = scene(tf.Rules(ageing, variables={"age": 0.25, "gfp": 1.5}))
+    state = tf.simulate(with_rule, until=0.2).last()
+    later = tf.simulate(
+        GREEN, state.declare(GREEN.bind().first_fields["circuit_volume"]), until=0.3
+    )
+    # made at 2, lost and diluted at 1 per hour each, for 0.1 h
+    assert later.last().gfp.item() == pytest.approx(1.0 + 0.5 * math.exp(-0.2), rel=0.01)
+
+
 def test_columns_of_the_first_cells_may_have_the_name_of_a_field():
     cells = tf.Cells.single(2, length=2.0)
     cells = tf.Cells(cells.position, cells.axis, length=2.0, extra={"division_threshold": [2.5]})

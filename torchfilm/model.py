@@ -25,7 +25,7 @@ from torchfilm.cell_types import kept_by_type
 from torchfilm.cpu_parts import CpuTwins, OnCpu
 from torchfilm.effect import BUILT_IN, DIVISION, FLAGGED_DIVISION, Binding, BoundEffect, is_own
 from torchfilm.founders import FirstCells
-from torchfilm.initial_cells import GIVEN, Cells
+from torchfilm.initial_cells import Cells
 from torchfilm.joined_step import JoinedStep, joined
 from torchfilm.resolver import BoundBatch
 from torchfilm.state import CELL, PER_CELL, Field, State
@@ -366,7 +366,7 @@ def _check_meanings(effect: BoundEffect, state: State) -> None:
     which cells divide is no added length."""
     for field in effect.declares():
         there = state.declared.get(field.name)
-        if there is None or there.meaning == GIVEN:
+        if there is None or not there.unit:  # as variables of rules, and what first cells brought
             continue
         if (there.meaning, there.unit, there.scope) != (field.meaning, field.unit, field.scope):
             about = lambda f: f"{f.meaning} ({f.unit or '1'}, per {f.scope})"
