@@ -158,8 +158,11 @@ def test_more_often_than_steps_is_refused():
     def feeds(cells):
         cells.fed = float(cells.every(0.01))
 
-    with pytest.raises(tf.InputError, match=r"cells\.every\(hours\) = 0\.01.*at least 0\.0"):
-        plain().replace(tf.Rules(feeds), *plain().effects).bind()
+    scene = plain().replace(tf.Rules(feeds), *plain().effects)
+    with pytest.raises(tf.InputError, match=r"cells\.every\(hours\) = 0\.01.*at least 0\.05"):
+        tf.simulate(scene, until=1.0).last()
+    fine = tf.Scene(*scene.effects, dim=2, dt=0.01)
+    assert tf.simulate(fine, until=0.05).last().fed.tolist() == [1.0]
 
 
 def test_the_table_of_a_state_makes_first_cells(grown):

@@ -38,6 +38,8 @@ def test_several_frames_make_one_table(swapped):
             chosen = [int(k) % len(results) for k in some]
             wanted = whole[whole.frame.isin(chosen)].reset_index(drop=True)
             pd.testing.assert_frame_equal(results.to_pandas(some), wanted)
+        with pytest.raises(tf.InputError, match=r"^frame = .*numpy\.flatnonzero\(mask\)"):
+            results.table(results.times > 0.3)
         for wrong in ([], [99], [1, 0], [0, 0], [True], [0.5], "last", np.array([0.5])):
             with pytest.raises(tf.InputError, match="frame"):
                 results.table(wrong)
@@ -129,6 +131,8 @@ def test_a_movie_that_ends_before_others_is_remarked_on():
     ):
         tf.Lineage.from_table(seen(), end=0.5)
     assert tf.Lineage.from_table(seen(), end=0.666666).now == 40 / 60
+    before = seen(time_min=[-300.0 - 10.0 * k for k in (4, 3, 2, 1, 0, 4, 3, 2)])
+    assert tf.Lineage.from_table(before, end=-5.0).fate.tolist() == ["alive", "lost"]
 
 
 def test_tracks_of_a_challenge_end_where_the_movie_did(tmp_path):
@@ -156,10 +160,10 @@ def test_times_of_the_clock_are_no_hours(kind):
 def test_whole_numbers_that_floats_round_are_remarked_on():
     cells = tf.Cells(
         [[0.0, 0.0], [9.0, 0.0]], [[1.0, 0.0]] * 2, length=[2.0] * 2, radius=[0.5] * 2,
-        extra={"track": [2**24, 2**24 + 1], "level": [0.1, 1e9 + 0.3]},
+        extra={"track": [2**24, 2**24 + 1], "level": [0.1, 1e11]},
     )  # fmt: skip
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), founders=cells, dt=0.1)
-    with pytest.warns(UserWarning, match=r"'track' has .*16777217 to 16777216.*float64"):
+    with pytest.warns(UserWarning, match=r"'track' has .*16777216 and 16777217.*float64"):
         scene.bind().start()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -169,6 +173,11 @@ def test_whole_numbers_that_floats_round_are_remarked_on():
     assert state.track.tolist() == [5, 2**53]
     with pytest.raises(tf.InputError, match=r"field 'track' = 9007199254740993.*float64 can hold"):
         exact.with_fields(track=torch.tensor([5, 2**53 + 1]))
+    plain = tf.Scene(tf.Growth(rate=1.0), dim=2, dt=0.1).bind(2).start()
+    with pytest.raises(tf.InputError, match=r"field 'growth_rate' = 2e\+300.*float32 can hold"):
+        plain.with_fields(growth_rate=torch.tensor([1.0, 2e300], dtype=torch.float64))
+    each = torch.func.vmap(lambda x: plain.with_fields(growth_rate=x).growth_rate)
+    assert each(torch.tensor([[1, 2], [3, 4]])).tolist() == [[1.0, 2.0], [3.0, 4.0]]
 
 
 def plain() -> tf.Scene:

@@ -109,6 +109,27 @@ def test_a_variable_of_rules_may_become_a_species():
     assert later.last().gfp.item() == pytest.approx(1.0 + 0.5 * math.exp(-0.2), rel=0.01)
 
 
+def test_a_species_may_become_a_variable_of_rules():
+    state = tf.simulate(GREEN, until=0.2).last()
+    ruled = scene(tf.Rules(ageing, variables={"age": 0.25, "gfp": 0.0}))
+    state = state.declare(tf.Field("age", "of mine", initial=7.0))
+    last = tf.simulate(ruled, state, until=0.4).last()
+    assert torch.equal(last.gfp, state.gfp) and last.age.item() == pytest.approx(7.2)
+
+
+def test_a_threshold_of_another_kind_is_refused_where_a_file_goes_on(tmp_path):
+    by_length, by_volume = scene(), scene(division=tf.Division(volume=4.0))
+    tf.simulate(by_length, until=0.2, record=tf.Recorder(tmp_path / "run.h5", by_length)).last()
+    with tf.Results(tmp_path / "run.h5") as results:
+        state = results.state(by_volume, changed=True)
+        with pytest.raises(tf.InputError, match=r"'division_threshold' of this state means length"):
+            tf.simulate(by_volume, state, until=0.4)
+        again = results.state(by_length, changed=True)
+    assert tf.simulate(by_length, again, until=0.4).last().time == pytest.approx(0.4)
+    taken = by_volume.take_over(state)
+    assert tf.simulate(by_volume, taken, until=0.4).last().division_threshold.tolist() == [4.0]
+
+
 def test_columns_of_the_first_cells_may_have_the_name_of_a_field():
     cells = tf.Cells.single(2, length=2.0)
     cells = tf.Cells(cells.position, cells.axis, length=2.0, extra={"division_threshold": [2.5]})

@@ -28,7 +28,7 @@ from torchfilm.founders import FirstCells
 from torchfilm.initial_cells import Cells
 from torchfilm.joined_step import JoinedStep, joined
 from torchfilm.resolver import BoundBatch
-from torchfilm.state import CELL, PER_CELL, Field, State
+from torchfilm.state import CELL, PER_CELL, Field, State, another_quantity
 from torchfilm.tools import checks, displays
 from torchfilm.tools.hashing import digest
 from torchfilm.tools.row_checks import Rows, check_declared, check_geometry
@@ -366,9 +366,8 @@ def _check_meanings(effect: BoundEffect, state: State) -> None:
     which cells divide is no added length."""
     for field in effect.declares():
         there = state.declared.get(field.name)
-        if there is None or not there.unit:  # as variables of rules, and what first cells brought
-            continue
-        if (there.meaning, there.unit, there.scope) != (field.meaning, field.unit, field.scope):
+        kept = effect.effect.keeps().values()
+        if there is not None and another_quantity(there, field, kept):
             about = lambda f: f"{f.meaning} ({f.unit or '1'}, per {f.scope})"
             raise checks.InputError(
                 f"{field.name!r} of this state means {about(there)}; to {effect.title} of this"

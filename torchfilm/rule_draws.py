@@ -93,6 +93,8 @@ class StepDraws(Draws):
     def every(self, hours: float) -> bool:
         """Whether a multiple of so many hours lies in this step, from its beginning on, and before
         its end. Raises InputError for less than a step."""
+        if self._asked is not None:  # a trial, whose step is none of the scene's
+            return checks.number("cells.every(hours)", hours, above=0.0) > 0.0
         hours = checks.number("cells.every(hours)", hours, least=self._dt * (1.0 - 1e-6))
         begin = self._state.time - 1e-6 * self._dt  # times are rounded
         return math.ceil(begin / hours) * hours < begin + self._dt

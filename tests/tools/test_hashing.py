@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections import deque
 from dataclasses import dataclass, field
+from decimal import Decimal
 from functools import partial
 from types import ModuleType
 
@@ -276,8 +278,9 @@ def of_class(body):
 
 CACHING = "import functools\n@functools.cache\ndef g(x): return x + {}\ndef f(x): return g(x)"
 WITHIN = "import math\ndef f(x): return [math.{}(y) for y in x]"
+CAUGHT = "def f(x):\n  try:\n    y = x[0]\n{}  except KeyError:\n    return 0\n{}  return y"
 HOLDING = (
-    "import numpy as np, types, collections, decimal, fractions, functools\n"
+    "import numpy as np, types, collections, datetime, decimal, fractions, functools, pathlib\n"
     "K = {}\ndef f(x): return x, K"
 )
 KINDS = (
@@ -285,6 +288,8 @@ KINDS = (
     "range({})", "types.SimpleNamespace(k={})", "types.MappingProxyType(dict(k={}))",
     "collections.deque([{}])", "decimal.Decimal({})", "fractions.Fraction({})",
     "functools.partial(max, {})", "np.array([{}, None], dtype=object)",
+    "[np.datetime64(1, 's'), np.datetime64({}, 's')]", "datetime.date(2026, 1, {})",
+    "pathlib.Path('a{}')", "np.array([({}, None)], dtype=[('a', int), ('b', object)])",
 )  # fmt: skip
 
 
@@ -295,6 +300,9 @@ KINDS = (
         ("K = {}\ndef f(x): return [y + K for y in x]", 1.0, 2.0),
         (WITHIN, "sin", "cos"),
         (CACHING, 1, 2),
+        ("def f({}x): return x", "", "*"),
+        ("def f(x):\n  try: y = x[0]\n  except KeyError: {}\n  return 1", "y = 1", "y = 2"),
+        ("{}", CAUGHT.format("    len(y)\n", ""), CAUGHT.format("", "  else:\n    len(y)\n")),
         *((HOLDING, kind.format(1), kind.format(2)) for kind in KINDS),
     ],
 )
@@ -361,10 +369,29 @@ def test_arrays_count_by_what_they_hold():
     assert digest(1.5) == digest(np.float64(1.5)) == digest(np.float32(1.5))
 
 
+def test_an_array_in_itself_and_equal_values_apart():
+    array = np.empty(1, dtype=object)
+    array[0] = array
+    assert digest(array) == digest(array)
+    make = lambda: (Decimal("1.5"), deque([1, 2]), range(3))
+    again = make()
+    assert digest([again, again]) == digest([make(), make()])
+
+
+def test_what_a_process_is_given_does_not_count(monkeypatch):
+    function = of_user("from os import environ\ndef f(x): return environ.get('JOB')")
+    before = digest(function)
+    monkeypatch.setenv("JOB", "2")
+    assert digest(function) == before
+
+
 def test_sets_are_alike_in_every_process():
     code = (
         "from torchfilm.tools.hashing import digest\n"
-        "def f(x): return x in {'a', 'bc', 'd', 'ef', 'g'}\n"
+        "class Strain:\n"
+        "  def __init__(self, name): self.name = name\n"
+        "STRAINS = {Strain(k) for k in range(5)}\n"
+        "def f(x): return x in {'a', 'bc', 'd', 'ef', 'g'} or x in STRAINS\n"
         "print(digest(f, {'a', 'bc', 'd', 'ef', 'g'}))"
     )
     found = {

@@ -112,7 +112,7 @@ class Division(Effect):
             fields.append(
                 Field(
                     "division_threshold",
-                    f"{name}{' length' * (name == 'added')} at which the cell divides",
+                    f"{name} at which the cell divides",
                     "µm³" if name == "volume" else "µm",
                     initial=_FIRST_THRESHOLD[name],
                     at_division="reset" if reset else "copy",

@@ -90,7 +90,7 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
                 shutil.rmtree(left, ignore_errors=True)
 
 
-def check_frames(count: int, frames: object, path: Path) -> list[int]:
+def check_frames(count: int, frames: object, path: Path, name: str = "frames") -> list[int]:
     """The numbers of the frames that are asked for, of a file with `count`: all of them without
     `frames`. Raises InputError for frames that it does not have, and for none."""
     if frames is None:
@@ -98,13 +98,14 @@ def check_frames(count: int, frames: object, path: Path) -> list[int]:
     if isinstance(frames, np.ndarray):
         frames = frames.reshape(-1).tolist()
     if not isinstance(frames, (list, tuple, range)) or not len(frames):
-        raise checks.input_error("frames", frames, "a list of at least one frame's number")
+        raise checks.input_error(name, frames, "a list of at least one frame's number")
     for k in frames:
         whole = isinstance(k, (int, np.integer)) and not isinstance(k, bool)
         if not whole or not -count <= k < count:
             rule = f"each from {-count} to {count - 1}: {path} has {count} frames"
-            raise checks.input_error("frames", frames, rule)
+            hint = "Of a mask, numpy.flatnonzero(mask)." if isinstance(k, bool) else ""
+            raise checks.input_error(name, frames, rule, hint)
     chosen = [int(k) % count for k in frames]
     if sorted(set(chosen)) != chosen:
-        raise checks.input_error("frames", frames, "in the order of time, each once")
+        raise checks.input_error(name, frames, "in the order of time, each once")
     return chosen

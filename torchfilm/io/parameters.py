@@ -87,7 +87,9 @@ def _alike(kept: np.ndarray, value: np.ndarray) -> bool:
 
 
 def _values(group: h5py.Group) -> dict[str, np.ndarray]:
-    return {name.replace(SLASH, "/"): x[...] for name, x in group.items()}
+    # earlier versions wrote the centre of a sphere so
+    path = lambda name: name.replace(SLASH, "/").replace("].center[", "].centre[")
+    return {path(name): x[...] for name, x in group.items()}
 
 
 def column_names(paths: list[str], taken: set[str]) -> dict[str, str]:

@@ -3,7 +3,8 @@ scene starts from."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from torchfilm.io.identity import check_fields, check_same_scene, declared_field
 from torchfilm.io.schema import check_frame
 from torchfilm.scene import Scene
 from torchfilm.signals.grid import Grid
-from torchfilm.state import OUTSIDE, PER_CELL, Field, State
+from torchfilm.state import OUTSIDE, PER_CELL, Field, State, another_quantity
 from torchfilm.tools import checks
 from torchfilm.tools.warn_once import quietly, warn
 
@@ -83,9 +84,12 @@ def restore_state(
         }
     recorded |= results.colony_fields(frame)
     declared = dict(template.declared)
+    kept = {name for effect in scene.effects for name in effect.keeps().values()}
     for name, about in declared_fields(results.attributes).items():
-        if name not in declared:
-            declared[name] = _field(name, about, recorded[name])
+        there, known = partial(_field, name, about, recorded), declared.get(name)
+        # what is another quantity to a changed scene is refused where that goes on
+        if known is None or (changed and another_quantity(there(), known, kept)):
+            declared[name] = there()
     return template.replace(
         **{n: tensor(recorded[n]) for n in PER_CELL},
         colony_id=tensor(results.colony_id),
@@ -124,9 +128,9 @@ def _template(results: Results, scene: Scene, device: torch.device, changed: boo
     return template
 
 
-def _field(name: str, about: list, values: np.ndarray) -> Field:
+def _field(name: str, about: list, recorded: Mapping[str, np.ndarray]) -> Field:
     """A field that the file holds and the scene does not declare, such as a column of the initial
     cells."""
     meaning, unit, scope, shape, at_division = about
-    dtype = torch.from_numpy(np.atleast_1d(values)).dtype
+    dtype = torch.from_numpy(np.atleast_1d(recorded[name])).dtype
     return Field(name, meaning, unit, scope, tuple(shape), dtype, at_division=at_division)

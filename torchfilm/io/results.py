@@ -57,8 +57,7 @@ class Results(metaclass=checks.KnownKeywords):
     def file(self) -> h5py.File:
         """The HDF5 file. Raises InputError where it is closed."""
         if not self._open:
-            within = "read inside `with tf.Results(…) as results:`, or open it again."
-            raise InputError(f"{self.path} is closed: {within}")
+            raise InputError(f"{self.path} is closed: read inside `with tf.Results(…) as results:`")
         return self._open
 
     def __enter__(self) -> Results:
@@ -284,7 +283,8 @@ class Results(metaclass=checks.KnownKeywords):
         that serve the numerics.
         """
         several = frame is None or isinstance(frame, (list, tuple, range, np.ndarray))
-        frames = check_frames(len(self), frame, self.path) if several else [self._index(frame)]
+        whole = lambda: check_frames(len(self), frame, self.path, "frame")
+        frames = whole() if several else [self._index(frame)]
         return Tables(self, self.lineage(), internals)(frames)
 
     @partial(checks.known_keywords, instead=BY_NUMBER)

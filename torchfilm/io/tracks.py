@@ -174,7 +174,7 @@ def _ended(tracks: Tracks, end: float | None, name: str) -> Tracks:
     if end is None:
         return tracks
     end, last = checks.number(name, end), float(tracks.end.max())
-    if end < last * (1.0 - 1e-5):  # as a message writes it
+    if end < last - 1e-5 * abs(last):  # as a message writes it
         raise checks.input_error(name, end, f"h, at least {last:g}, when cells were last seen")
     return replace(tracks, end=np.full(len(tracks.end), max(end, last)))
 

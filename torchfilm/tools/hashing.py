@@ -5,16 +5,17 @@ from __future__ import annotations
 import dataclasses
 import dis
 import hashlib
+import inspect
 import re
 import sys
 from collections import deque
 from collections.abc import Iterator, Mapping
+from datetime import date, time, timedelta
 from decimal import Decimal
 from fractions import Fraction
 from functools import cache, partial
-from inspect import unwrap
-from pathlib import Path
-from types import CodeType, FunctionType, MethodType, ModuleType, SimpleNamespace
+from pathlib import Path, PurePath
+from types import CodeType, FunctionType, MappingProxyType, MethodType, ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -88,7 +89,13 @@ def _objects(things: tuple[Any, ...]) -> Iterator[Any]:
             queue += reversed(_parts(thing, weights=True))
 
 
-_NUMBERS = (str, bytes, int, float, bool, complex, type(None), np.ndarray)
+# Values that count as they are written.
+_VALUES = (
+    str, bytes, int, float, bool, complex, type(None), range, Decimal, Fraction, date, time,
+    timedelta, PurePath,
+)  # fmt: skip
+_NUMBERS = (*_VALUES, np.ndarray)
+_MANY = (tuple, list, set, frozenset, deque, np.ndarray)
 
 
 class _Word:
@@ -96,8 +103,9 @@ class _Word:
 
     def __init__(self, *, weights: bool):
         self.weights, self.hasher = weights, hashlib.sha256()
-        #: the numbers of what refers to others and was met before, by their ids
-        self.met: dict[int, int] = {}
+        #: the numbers of what refers to others and was met before, by their ids; with the objects
+        #: themselves, whose ids may not be given to others
+        self.met: dict[int, tuple[int, Any]] = {}
 
     def of(self, thing: Any) -> str:
         self._add(thing, set())
@@ -106,28 +114,26 @@ class _Word:
     def _add(self, thing: Any, enclosing: set[int]) -> None:
         if isinstance(thing, torch.Tensor):
             thing = _numbers_of(thing)
-        if isinstance(thing, np.generic):
-            thing = thing.item()
-        if isinstance(thing, np.ndarray) and thing.dtype.kind == "O":
-            thing = ["array of objects", thing.shape, *thing.ravel().tolist()]
-        if isinstance(thing, np.ndarray):
+        if isinstance(thing, np.generic):  # hours and the like have no number of Python's
+            thing = np.asarray(thing) if thing.dtype.kind in "mMV" else thing.item()
+        if isinstance(thing, np.ndarray) and not thing.dtype.hasobject:
             if thing.dtype.kind == "f":
                 # a number from a file equals the written number, in any precision
                 thing = thing.astype(np.float64)
             about = f"array {thing.dtype} {thing.shape} ".encode()
             self.hasher.update(about + np.ascontiguousarray(thing).tobytes())
             return
-        if isinstance(thing, _NUMBERS):
+        if isinstance(thing, _VALUES):
             self.hasher.update(f"{type(thing).__name__} {thing!r};".encode())
             return
         if id(thing) in enclosing:  # an object that contains itself, such as a recursive function
             self.hasher.update(b"again;")
             return
         if id(thing) in self.met:  # what refers to one another has many ways to each
-            self.hasher.update(f"object {self.met[id(thing)]} again;".encode())
+            self.hasher.update(f"object {self.met[id(thing)][0]} again;".encode())
             return
         if _is_plain_object(thing):
-            self.met[id(thing)] = len(self.met)
+            self.met[id(thing)] = len(self.met), thing
         enclosing = enclosing | {id(thing)}
         # a list may have been a tuple before it was written to a file
         kind = "list" if isinstance(thing, tuple) else type(thing).__name__
@@ -136,7 +142,7 @@ class _Word:
         for part in parts:
             self._add(part, enclosing)
         if isinstance(thing, FunctionType) and any(isinstance(x, FunctionType) for x in parts):
-            self.met[id(thing)] = len(self.met)
+            self.met[id(thing)] = len(self.met), thing
         self.hasher.update(b")")
 
 
@@ -164,10 +170,12 @@ def _parts(thing: Any, *, weights: bool) -> list[Any]:
         return _instructions(thing)
     if isinstance(thing, Mapping):
         return [x for key, value in thing.items() for x in (key, value)]
-    if isinstance(thing, (tuple, list)):
+    if isinstance(thing, (tuple, list, deque)):
         return list(thing)
+    if isinstance(thing, np.ndarray):
+        return [thing.shape, *thing.ravel().tolist()]
     if isinstance(thing, (set, frozenset)):
-        return sorted(map(repr, thing))
+        return sorted(thing, key=lambda x: _Word(weights=weights).of(x))
     if (
         isinstance(thing, type)
         or not (hasattr(thing, "__dict__") or _slots(thing))
@@ -193,9 +201,11 @@ def _parts(thing: Any, *, weights: bool) -> list[Any]:
 
 
 def _instructions(code: CodeType) -> list[Any]:
-    """What a code does: its instructions, with the constants that they load. A docstring is loaded
-    by none, but its place among the constants would change the others' numbers."""
-    found: list[Any] = []
+    """What a code does: its arguments, its instructions with the constants that they load, and
+    where errors are caught. A docstring is loaded by none, but its place among the constants would
+    change the others' numbers."""
+    arguments = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount
+    found: list[Any] = [*arguments, code.co_flags & ARGUMENTS_AND_KIND, code.co_exceptiontable]
     of_values = {*dis.hasconst, *dis.hasname}
     for i in dis.get_instructions(code):
         if i.opname != "EXTENDED_ARG":
@@ -203,10 +213,16 @@ def _instructions(code: CodeType) -> list[Any]:
     return found
 
 
-# What counts as it is.
+# *arguments, **arguments, generators and coroutines
+ARGUMENTS_AND_KIND = (
+    inspect.CO_VARARGS | inspect.CO_VARKEYWORDS | inspect.CO_GENERATOR | inspect.CO_COROUTINE
+    | inspect.CO_ASYNC_GENERATOR
+)  # fmt: skip
+# Of what a function or a class uses, these count, wherever their types are defined. (None is what a
+# name that is not there yet gives.)
 PLAIN = (
-    str, bytes, int, float, complex, bool, tuple, list, set, frozenset, range, deque, Mapping,
-    Decimal, Fraction, SimpleNamespace, np.generic, np.ndarray, torch.Tensor, partial,
+    *(kind for kind in _VALUES if kind is not type(None)), tuple, list, set, frozenset, deque, dict,
+    MappingProxyType, SimpleNamespace, np.generic, np.ndarray, torch.Tensor, partial,
 )  # fmt: skip
 
 
@@ -276,7 +292,7 @@ def _script(name: str, thing: object = None) -> str:
     """The name by which the script that runs is imported; `name` where there is no file of it.
     thing: defined there; another process may have sent it."""
     main = sys.modules.get("__main__")
-    code = unwrap(thing).__code__ if isinstance(thing, FunctionType) else None
+    code = inspect.unwrap(thing).__code__ if isinstance(thing, FunctionType) else None
     if code is None:  # an object that is called
         own = [vars(c)["__call__"] for c in type(thing).__mro__ if "__call__" in vars(c)]
         code = getattr(own[0], "__code__", None) if own else None
@@ -295,7 +311,7 @@ def _is_plain_object(thing: Any) -> bool:
     """Whether it is an object of a class of a user's, but no dataclass."""
     kind = type(thing)
     return not (
-        isinstance(thing, (FunctionType, MethodType, CodeType, partial, type, Mapping, tuple, list))
+        isinstance(thing, (FunctionType, MethodType, CodeType, partial, type, Mapping, *_MANY))
         or dataclasses.is_dataclass(thing)
         or kind.__module__.split(".")[0] in OURS
     )

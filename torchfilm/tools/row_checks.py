@@ -198,10 +198,12 @@ def _of_kind(name: str, value: Tensor, dtype: torch.dtype) -> Tensor:
         hint = "Convert it: value > 0." if truth else f"Convert it: value.to({dtype})."
         raise checks.input_error(f"type of the field {name!r}", value.dtype, wanted, hint)
     made = value.to(dtype)
-    if not (fraction or truth) and not torch.equal(made.to(value.dtype), value):
-        at = torch.nonzero(made.to(value.dtype) != value)[0]
-        lost = value[tuple(at.tolist())].item()
-        raise checks.input_error(f"the field {name!r}", lost, f"a number that {dtype} can hold")
+    if truth or torch._C._functorch.is_functorch_wrapped_tensor(value):
+        return made
+    lost = made.isinf() & value.isfinite() if fraction else made.to(value.dtype) != value
+    if bool(lost.any()):
+        first = value[lost][0].item()
+        raise checks.input_error(f"the field {name!r}", first, f"a number that {dtype} can hold")
     return made
 
 
@@ -222,15 +224,16 @@ def _check_numbers(colony: Tensor, uid: Tensor) -> None:
 
 
 def warn_of_rounding(name: str, values: np.ndarray, dtype: torch.dtype) -> None:
-    """Warn of whole numbers, such as those of tracks, that a type of float cannot hold."""
-    kept = torch.as_tensor(values.copy()).to(dtype).to(torch.float64).numpy()
-    lost = np.flatnonzero((values == np.round(values)) & (kept != values) & np.isfinite(values))
-    if lost.size:
-        k = int(lost[0])
+    """Warn of whole numbers, such as those of tracks, of which a type of float makes one."""
+    whole = np.unique(values[(values == np.round(values)) & np.isfinite(values)])
+    kept = torch.as_tensor(whole.copy()).to(dtype).to(torch.float64).numpy()
+    alike = np.flatnonzero(np.diff(kept) == 0.0)
+    if alike.size:
+        k = int(alike[0])
         warn(
-            f"{name} has whole numbers that {str(dtype).removeprefix('torch.')} rounds, such as"
-            f" {values[k]:.0f} to {kept[k]:.0f}: where they name cells, number these from 0, or"
-            " bind with dtype=torch.float64."
+            f"{name} has whole numbers that {str(dtype).removeprefix('torch.')} cannot tell apart,"
+            f" such as {whole[k]:.0f} and {whole[k + 1]:.0f}: where they name cells, number these"
+            " from 0, or bind with dtype=torch.float64."
         )
 
 
