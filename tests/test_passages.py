@@ -174,3 +174,35 @@ def test_the_table_of_a_state_makes_first_cells(grown):
         state.length, grown.length
     )
     assert torch.allclose(state.axis, grown.axis, atol=1e-6)
+
+
+def passages(path, numbers, state=None):
+    """As the page of states does it; a protocol that goes on begins with what its file has."""
+    scene = plain()
+    state = scene.bind(3, seed=4).start() if state is None else state
+    for number in numbers:
+        kept = state.remove(~state.sample_cells(5))
+        recorder = tf.Recorder(path, scene, append=number > 0)
+        state = tf.simulate(scene, kept, until=2.0 * (number + 1), record=recorder).last()
+    return state
+
+
+def test_a_protocol_goes_on_from_its_file_as_if_it_had_not_stopped(tmp_path):
+    whole = passages(tmp_path / "whole.h5", range(4))
+    passages(tmp_path / "parts.h5", range(2))
+    with tf.Results(tmp_path / "parts.h5") as results:
+        state = results.state(plain())
+    assert state.counts.min() > 5
+    parts = passages(tmp_path / "parts.h5", range(2, 4), state)
+    assert torch.equal(parts.uid, whole.uid) and torch.equal(parts.length, whole.length)
+    with tf.Results(tmp_path / "whole.h5") as one, tf.Results(tmp_path / "parts.h5") as other:
+        assert one.lineage().clone_sizes(1) == other.lineage().clone_sizes(1)
+        removed = other.lineage().fate == "removed"
+        assert set(other.lineage().ended[removed]) <= {2.0, 4.0, 6.0}
+
+
+def test_variables_with_the_names_of_columns_come_back_from_a_table():
+    ages = tf.Rules(lambda cells: None, variables={"age": 1.5, "born": 2.5})
+    state = plain().replace(ages, *plain().effects).bind().start()
+    cells = tf.Cells.from_table(tf.cell_table(state), length_unit="um", angle_unit="radians")
+    assert cells.extra["age"].tolist() == [1.5] and cells.extra["born"].tolist() == [2.5]

@@ -384,7 +384,9 @@ def _fields(table: Table, reading: Reading, used: set[str]) -> dict[str, np.ndar
     numbering = (*LABELS, *FRAMES, *ROWS)
     left = [n for n in table.columns if n not in used and n.lower() not in numbering]
     if all(n in table.columns for n in OF_STATES):  # signals outside have dots
-        left = [n for n in left if n not in OF_STATES + OF_RESULTS and n.isidentifier()]
+        own = lambda name: name.removeprefix("field.")  # beside a column of its name
+        left = [n for n in left if n not in OF_STATES + OF_RESULTS and own(n).isidentifier()]
+        return {own(name): table.numbers(name, optional=True) for name in left}
     return {name: table.numbers(name, optional=True) for name in left}
 
 
