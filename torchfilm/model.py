@@ -364,9 +364,9 @@ def advanced(state: State, dt: float) -> State:
 def _check_meanings(effect: BoundEffect, state: State) -> None:
     """Raise InputError for a field of a state that is another quantity to the effect: a length at
     which cells divide is no added length."""
+    kept = effect.effect.keeps().values()
     for field in effect.declares():
         there = state.declared.get(field.name)
-        kept = effect.effect.keeps().values()
         if there is not None and another_quantity(there, field, kept):
             about = lambda f: f"{f.meaning} ({f.unit or '1'}, per {f.scope})"
             raise checks.InputError(
