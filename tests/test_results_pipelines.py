@@ -165,6 +165,9 @@ def test_whole_numbers_that_floats_round_are_remarked_on():
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), founders=cells, dt=0.1)
     with pytest.warns(UserWarning, match=r"'track' has .*16777216 and 16777217.*float64"):
         scene.bind().start()
+    huge = tf.Cells([[0.0, 0.0], [9.0, 0.0]], [1.0, 0.0], extra={"total": [1e39, 2e39]})
+    with pytest.warns(UserWarning, match=r"'total' has whole numbers that float32 cannot tell"):
+        scene.bind(cells=huge)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         exact = scene.bind(dtype=torch.float64).start()

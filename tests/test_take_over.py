@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass, replace
 
+import h5py
 import pytest
 import torch
 
@@ -115,6 +117,27 @@ def test_a_species_may_become_a_variable_of_rules():
     state = state.declare(tf.Field("age", "of mine", initial=7.0))
     last = tf.simulate(ruled, state, until=0.4).last()
     assert torch.equal(last.gfp, state.gfp) and last.age.item() == pytest.approx(7.2)
+
+
+@pytest.mark.parametrize("change", [{"scope": "colony"}, {"shape": (2,)}])
+def test_a_variable_of_another_scope_or_shape_is_refused(change):
+    state = scene().bind(2).start().declare(tf.Field("age", "of mine", **change))
+    ruled = scene(tf.Rules(ageing, variables={"age": 0.25}))
+    with pytest.raises(tf.InputError, match=r"'age' of this state means of mine.*take_over"):
+        ruled.bind(state=state)
+    assert ruled.take_over(state).age.tolist() == [0.25, 0.25]
+
+
+def test_words_of_earlier_versions_are_the_same_quantity(tmp_path):
+    with_age, path = scene(), tmp_path / "run.h5"
+    tf.simulate(with_age, until=0.2, record=tf.Recorder(path, with_age)).last()
+    with h5py.File(path, "a") as file:
+        declared = json.loads(file.attrs["declared"])
+        declared["growth_rate"][0] = "relative growth rate"
+        file.attrs["declared"] = json.dumps(declared)
+    with tf.Results(path) as results:
+        state = results.state(with_age, changed=True)
+    assert tf.simulate(with_age, state, until=0.4).last().time == pytest.approx(0.4)
 
 
 def test_a_threshold_of_another_kind_is_refused_where_a_file_goes_on(tmp_path):

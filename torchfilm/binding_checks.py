@@ -14,7 +14,7 @@ from torchfilm.effect import BUILT_IN, BoundEffect, Effect, is_own, makes_longer
 from torchfilm.parameters import parameters
 from torchfilm.resolver import FirstValue
 from torchfilm.rule_views import KNOWN_FIELDS, MEANS
-from torchfilm.state import CELL, OUTSIDE, PER_CELL, State
+from torchfilm.state import CELL, OUTSIDE, PER_CELL, Field, State
 from torchfilm.tools import checks, row_checks
 from torchfilm.tools.hashing import trained
 from torchfilm.tools.tangents import tracked
@@ -236,6 +236,19 @@ def _check_adds(effects: Sequence[BoundEffect], state: State, cells: int) -> Non
         warn(f"{text} The run ends only if every such colony loses all cells. {hint}")
         return
     raise checks.InputError(f"{text} {hint}")
+
+
+def another_quantity(there: Field, wanted: Field, kept: Sequence[str]) -> bool:
+    """Whether a field of a state is another quantity than is wanted: of another scope, shape or
+    unit, if both have one; or, where it is several times among those `kept`, since it holds one of
+    several, of other words."""
+    if (there.scope, tuple(there.shape)) != (wanted.scope, tuple(wanted.shape)):
+        return True
+    if not there.unit or not wanted.unit:  # variables of rules, and what first cells brought
+        return False
+    return there.unit != wanted.unit or (
+        kept.count(wanted.name) > 1 and there.meaning != wanted.meaning
+    )
 
 
 def check_fits(state: object, model: Model, fields: Mapping[str, object]) -> None:

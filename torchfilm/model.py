@@ -28,7 +28,7 @@ from torchfilm.founders import FirstCells
 from torchfilm.initial_cells import Cells
 from torchfilm.joined_step import JoinedStep, joined
 from torchfilm.resolver import BoundBatch
-from torchfilm.state import CELL, PER_CELL, Field, State, another_quantity
+from torchfilm.state import CELL, PER_CELL, Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.hashing import digest
 from torchfilm.tools.row_checks import Rows, check_declared, check_geometry
@@ -364,10 +364,10 @@ def advanced(state: State, dt: float) -> State:
 def _check_meanings(effect: BoundEffect, state: State) -> None:
     """Raise InputError for a field of a state that is another quantity to the effect: a length at
     which cells divide is no added length."""
-    kept = effect.effect.keeps().values()
+    kept = [*effect.effect.keeps().values()]
     for field in effect.declares():
         there = state.declared.get(field.name)
-        if there is not None and another_quantity(there, field, kept):
+        if there is not None and binding_checks.another_quantity(there, field, kept):
             about = lambda f: f"{f.meaning} ({f.unit or '1'}, per {f.scope})"
             raise checks.InputError(
                 f"{field.name!r} of this state means {about(there)}; to {effect.title} of this"

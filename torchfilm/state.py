@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -65,15 +65,6 @@ class Field(metaclass=checks.KnownKeywords):
             return torch.full(shape, self.initial, dtype=dtype, device=state.device)
         found = row_checks.first_values(self.name, self.initial(state, rows), shape)
         return found.to(dtype)
-
-
-def another_quantity(there: Field, wanted: Field, kept: Container[str]) -> bool:
-    """Whether a field of a state is another quantity than is wanted, as far as both have units:
-    another unit or scope, or, of the fields `kept` of physical values, other words."""
-    if not there.unit or not wanted.unit:  # variables of rules, and what first cells brought
-        return False
-    alike = (there.unit, there.scope) == (wanted.unit, wanted.scope)
-    return not alike or (wanted.name in kept and there.meaning != wanted.meaning)
 
 
 @dataclass(frozen=True)

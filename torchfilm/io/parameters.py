@@ -88,7 +88,8 @@ def _alike(kept: np.ndarray, value: np.ndarray) -> bool:
 
 def _values(group: h5py.Group) -> dict[str, np.ndarray]:
     # earlier versions wrote the centre of a sphere so
-    path = lambda name: name.replace(SLASH, "/").replace("].center[", "].centre[")
+    now = lambda name: re.sub(r"^(Mechanics\.walls\[\d+\])\.center\b", r"\1.centre", name)
+    path = lambda name: now(name.replace(SLASH, "/"))
     return {path(name): x[...] for name, x in group.items()}
 
 

@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 from torchfilm.binding import bind
+from torchfilm.binding_checks import another_quantity
 from torchfilm.initial_cells import Cells
 from torchfilm.io.identity import check_fields, check_same_scene, declared_fields
 from torchfilm.io.schema import check_frame
 from torchfilm.scene import Scene
 from torchfilm.signals.grid import Grid
-from torchfilm.state import OUTSIDE, PER_CELL, Field, State, another_quantity
+from torchfilm.state import OUTSIDE, PER_CELL, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.warn_once import quietly, warn
 
@@ -84,7 +85,7 @@ def restore_state(
         }
     recorded |= results.colony_fields(frame)
     declared = dict(template.declared)
-    kept = {name for effect in scene.effects for name in effect.keeps().values()}
+    kept = [name for effect in scene.effects for name in effect.keeps().values()]
     for name, about in declared_fields(results.attributes).items():
         there, known = partial(_field, name, about, recorded), declared.get(name)
         # what is another quantity to a changed scene is refused where that goes on

@@ -99,19 +99,20 @@ _MANY = (tuple, list, set, frozenset, deque, np.ndarray)
 
 
 class _Word:
-    """The digest of some things while it is made. weights: whether those of networks count."""
+    """The digest of some things while it is made. weights: whether those of networks count. depth:
+    how many sets it is within."""
 
-    def __init__(self, *, weights: bool):
-        self.weights, self.hasher = weights, hashlib.sha256()
+    def __init__(self, *, weights: bool, depth: int = 0):
+        self.weights, self.depth, self.hasher = weights, depth, hashlib.sha256()
         #: the numbers of what refers to others and was met before, by their ids; with the objects
         #: themselves, whose ids may not be given to others
         self.met: dict[int, tuple[int, Any]] = {}
 
-    def of(self, thing: Any) -> str:
-        self._add(thing, set())
+    def of(self, thing: Any, enclosing: frozenset[int] = frozenset()) -> str:
+        self._add(thing, enclosing)
         return self.hasher.hexdigest()[:16]
 
-    def _add(self, thing: Any, enclosing: set[int]) -> None:
+    def _add(self, thing: Any, enclosing: frozenset[int]) -> None:
         if isinstance(thing, torch.Tensor):
             thing = _numbers_of(thing)
         if isinstance(thing, np.generic):  # hours and the like have no number of Python's
@@ -124,7 +125,9 @@ class _Word:
             self.hasher.update(about + np.ascontiguousarray(thing).tobytes())
             return
         if isinstance(thing, _VALUES):
-            self.hasher.update(f"{type(thing).__name__} {thing!r};".encode())
+            shown = repr(thing)
+            shown = shown if isinstance(thing, (str, bytes)) else without_addresses(shown)
+            self.hasher.update(f"{type(thing).__name__} {shown};".encode())
             return
         if id(thing) in enclosing:  # an object that contains itself, such as a recursive function
             self.hasher.update(b"again;")
@@ -135,6 +138,9 @@ class _Word:
         if _is_plain_object(thing):
             self.met[id(thing)] = len(self.met), thing
         enclosing = enclosing | {id(thing)}
+        if isinstance(thing, (set, frozenset)):
+            self.hasher.update(" ".join(self._words(thing, enclosing)).encode())
+            return
         # a list may have been a tuple before it was written to a file
         kind = "list" if isinstance(thing, tuple) else type(thing).__name__
         self.hasher.update(f"{kind}(".encode())
@@ -144,6 +150,12 @@ class _Word:
         if isinstance(thing, FunctionType) and any(isinstance(x, FunctionType) for x in parts):
             self.met[id(thing)] = len(self.met), thing
         self.hasher.update(b")")
+
+    def _words(self, members: set[Any] | frozenset[Any], enclosing: frozenset[int]) -> list[str]:
+        """What counts of a set: the words of its members, which have no order. Of sets that sets
+        of objects hold, their sizes alone: each is a digest of its own, and would take long."""
+        word = lambda x: _Word(weights=self.weights, depth=self.depth + 1).of(x, enclosing)
+        return ["set", str(len(members)), *(sorted(map(word, members)) if self.depth < 2 else [])]
 
 
 # The names of the script that runs, in its own process and in those that it starts.
@@ -175,7 +187,7 @@ def _parts(thing: Any, *, weights: bool) -> list[Any]:
     if isinstance(thing, np.ndarray):
         return [thing.shape, *thing.ravel().tolist()]
     if isinstance(thing, (set, frozenset)):
-        return sorted(thing, key=lambda x: _Word(weights=weights).of(x))
+        return sorted(thing, key=lambda x: without_addresses(repr(x)))
     if (
         isinstance(thing, type)
         or not (hasattr(thing, "__dict__") or _slots(thing))
@@ -219,9 +231,10 @@ ARGUMENTS_AND_KIND = (
     | inspect.CO_ASYNC_GENERATOR
 )  # fmt: skip
 # Of what a function or a class uses, these count, wherever their types are defined. (None is what a
-# name that is not there yet gives.)
+# name that is not there yet gives; paths differ where a project is copied.)
 PLAIN = (
-    *(kind for kind in _VALUES if kind is not type(None)), tuple, list, set, frozenset, deque, dict,
+    *(kind for kind in _VALUES if kind not in (type(None), PurePath)), tuple, list, set, frozenset,
+    deque, dict,
     MappingProxyType, SimpleNamespace, np.generic, np.ndarray, torch.Tensor, partial,
 )  # fmt: skip
 

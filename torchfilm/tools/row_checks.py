@@ -198,7 +198,9 @@ def _of_kind(name: str, value: Tensor, dtype: torch.dtype) -> Tensor:
         hint = "Convert it: value > 0." if truth else f"Convert it: value.to({dtype})."
         raise checks.input_error(f"type of the field {name!r}", value.dtype, wanted, hint)
     made = value.to(dtype)
-    if truth or torch._C._functorch.is_functorch_wrapped_tensor(value):
+    # on a GPU a look at the numbers would wait for it, as often as an effect gives such a field
+    unseen = fraction and value.device.type != "cpu"
+    if truth or unseen or torch._C._functorch.is_functorch_wrapped_tensor(value):
         return made
     lost = made.isinf() & value.isfinite() if fraction else made.to(value.dtype) != value
     if bool(lost.any()):
@@ -227,7 +229,7 @@ def warn_of_rounding(name: str, values: np.ndarray, dtype: torch.dtype) -> None:
     """Warn of whole numbers, such as those of tracks, of which a type of float makes one."""
     whole = np.unique(values[(values == np.round(values)) & np.isfinite(values)])
     kept = torch.as_tensor(whole.copy()).to(dtype).to(torch.float64).numpy()
-    alike = np.flatnonzero(np.diff(kept) == 0.0)
+    alike = np.flatnonzero(kept[1:] == kept[:-1])
     if alike.size:
         k = int(alike[0])
         warn(
