@@ -60,11 +60,11 @@ def bind(
     first = model.trace(None)
     if only is None:  # a part of a scene lacks what the rest of it declares
         binding_checks.check_names(model.effects, scene.declared_by, first)
-    model.check(first, values=False)
+    model.check_form(first)
     if check_first:
         for effect in model.effects:
             effect.check(first)
-        model.check(first)
+        model.check_values(first)
     if check_first and only is None:
         binding_checks.warn_of_idle(model.effects, first)
         binding_checks.warn_of_other_names(first, founders.extra)

@@ -198,8 +198,14 @@ class Model:
 
     # --- checks --------------------------------------------------------------------------
 
-    def check(self, state: State, *, values: bool = True) -> None:
-        """Raise InputError if this is not a state of this model. values: look at these, too."""
+    def check(self, state: State) -> None:
+        """Raise InputError if this is not a state of this model, or has values with which none can
+        go on."""
+        self.check_form(state)
+        self.check_values(state)
+
+    def check_form(self, state: State) -> None:
+        """Raise InputError if this is not a state of this model, whatever its values."""
         if state.dim != self.dim:
             raise checks.input_error("state", f"{state.dim}-D", f"{self.dim}-D, as the scene is")
         there = checks.same_device(state.device, self.batch.device)
@@ -220,9 +226,6 @@ class Model:
                 f"{path} has {tensor.numel()} values, but the batch has a colony number {highest}:"
                 " the state is not of this scene."
             )
-        own = [e for e in self.effects if is_own(e.effect)]
-        set_by = lambda e: state.fields if e.effect.writes_anything else e.writes()
-        free = {name for e in own for name in set_by(e)}
         for effect in self.effects:
             if not is_own(effect.effect):
                 _check_meanings(effect, state)
@@ -234,8 +237,14 @@ class Model:
                     raise checks.InputError(
                         f"{effect.title} needs the field {name!r}, which this state lacks. {hint}"
                     )
-            if values:
-                effect.check_given(state, free)
+
+    def check_values(self, state: State) -> None:
+        """Raise InputError for values with which no run can go on."""
+        own = [e for e in self.effects if is_own(e.effect)]
+        set_by = lambda e: state.fields if e.effect.writes_anything else e.writes()
+        free = {name for e in own for name in set_by(e)}
+        for effect in self.effects:
+            effect.check_given(state, free)
 
     def check_step(self, dt: float) -> None:
         """Raise InputError for a step that no effect can follow."""

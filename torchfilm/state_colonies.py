@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.tools import checks, displays, random, row_checks
-from torchfilm.tools.ragged import offsets
+from torchfilm.tools.ragged import offsets, order_within
 from torchfilm.tools.threads import one_torch_thread
 
 if TYPE_CHECKING:
@@ -76,10 +76,8 @@ def sampled(state: State, count: int, purpose: str) -> Tensor:
     every = torch.arange(state.cells, device=state.device)
     # two draws, since one has values that repeat among many cells
     coarse, fine = (drawn(state, random.uniform, every, f"{purpose} {k}") for k in (0, 1))
-    order = torch.argsort(random.fine_uniform(coarse, fine), stable=True)
-    order = order[torch.argsort(state.colony[order], stable=True)]
-    first = state.counts.cumsum(0) - state.counts
-    rank = every - first[state.colony[order]]
+    order = order_within(state.colony, random.fine_uniform(coarse, fine))
+    rank = every - offsets(state.counts)[state.colony[order]]
     return torch.zeros_like(every, dtype=torch.bool).index_copy(0, order, rank < count)
 
 

@@ -16,6 +16,7 @@ from torchfilm.signals.schedule import warn_of_means
 from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.deterministic_math import power
+from torchfilm.tools.ragged import order_within
 from torchfilm.tools.random import fine_uniform
 from torchfilm.tools.read_only import read_only
 from torchfilm.values import COLONY, ScheduledValue, physical
@@ -145,8 +146,7 @@ class _Stacks:
     """The cells of each column, from the highest down, and which of them is on top."""
 
     def __init__(self, columns: Columns):
-        order = torch.argsort(columns.top, descending=True, stable=True)
-        order = order[torch.argsort(columns.place[order], stable=True)]
+        order = order_within(columns.place, columns.top, descending=True)
         # and one more, for columns in which there is none
         self._cells = torch.cat([columns.cell[order], columns.cell.new_zeros(1)])
         self._tops = torch.cat([columns.top[order], columns.top.new_zeros(1)])

@@ -11,6 +11,7 @@ from torchfilm.spatial import checked_edges, kinds_of
 from torchfilm.state import State
 from torchfilm.tools import checks, row_checks
 from torchfilm.tools.connected import components
+from torchfilm.tools.ragged import order_within
 
 
 @of_a_state
@@ -81,8 +82,7 @@ def clusters(state: State, gap: float, name: str | None = None) -> Tensor:
     # their first cells: of several writes to one place torch keeps any, of a minimum the least
     number = torch.arange(state.cells, device=state.device)
     begin = number.new_full((len(sizes),), state.cells).scatter_reduce(0, of, number, "amin")
-    order = torch.argsort(begin, stable=True)
-    order = order[torch.argsort(sizes[order], descending=True, stable=True)]
+    order = order_within(-sizes, begin)
     order = order[torch.argsort(state.colony[begin[order]], stable=True)]
     colony = state.colony[begin[order]]
     place = torch.arange(len(order), device=state.device)

@@ -49,6 +49,12 @@ def offsets(counts: Tensor) -> Tensor:
     return out
 
 
+def order_within(group: Tensor, value: Tensor, *, descending: bool = False) -> Tensor:
+    """The rows (N,) sorted by group, and within each by value; equal ones stay in their order."""
+    order = torch.argsort(value, descending=descending, stable=True)
+    return order[torch.argsort(group[order], stable=True)]
+
+
 def repeated(value: Tensor, count: Tensor, total: int | None = None) -> Tensor:
     """Each integer (K,) as often as `count` (K,) says; total: how many that are, where the host
     knows it."""

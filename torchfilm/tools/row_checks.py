@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.tools import checks
+from torchfilm.tools.ragged import order_within
 from torchfilm.tools.warn_once import warn
 
 # What a user may give where whole numbers, or numbers, are wanted in a row.
@@ -211,8 +212,7 @@ def _of_kind(name: str, value: Tensor, dtype: torch.dtype) -> Tensor:
 
 def _check_numbers(colony: Tensor, uid: Tensor) -> None:
     """Raises InputError for two cells of a colony with one number, by which they draw."""
-    order = torch.argsort(uid, stable=True)
-    order = order[torch.argsort(colony[order], stable=True)]
+    order = order_within(colony, uid)
     twice = (uid[order].diff() == 0) & (colony[order].diff() == 0)
     if bool(twice.any()):
         k = int(torch.nonzero(twice)[0])
