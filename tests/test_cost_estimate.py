@@ -11,8 +11,8 @@ import torchfilm as tf
 from torchfilm.cost_estimate import (
     COLUMNS,
     ROWS,
-    Block,
     CostProbe,
+    ProbeSteps,
     Spending,
     crowd,
     probe,
@@ -37,7 +37,7 @@ def test_a_fit_gives_back_what_is_linear():
         "division": (0.0, 0.0, 0.0),
     }
     blocks = [
-        Block(n, b, {t: x + y * n + z * b for t, (x, y, z) in truth.items()}, {})
+        ProbeSteps(n, b, {t: x + y * n + z * b for t, (x, y, z) in truth.items()}, {})
         for n, b in ((32, 1), (40, 1), (256, 8), (300, 8), (420, 8))
     ]
     model = scene.bind()
@@ -53,7 +53,7 @@ def test_a_fit_gives_back_what_is_linear():
 @pytest.mark.parametrize(("drag", "power"), [(None, 1.65), (10.0, 1.0)])
 def test_contacts_of_large_colonies_in_free_growth_cost_more_a_cell(drag, power):
     model = tf.Scene(*BODY[:2], tf.Mechanics(dim=2, length_drag=drag)).bind()
-    blocks = [Block(n, 1, {e.title: 1e-5 * n for e in model.effects}, {}) for n in (32, 64)]
+    blocks = [ProbeSteps(n, 1, {e.title: 1e-5 * n for e in model.effects}, {}) for n in (32, 64)]
     state = model.start()
     costs = CostProbe(model, blocks, state, state, "", True, 1.0).fit("seconds")
     contacts, growth = costs["mechanics"], costs["growth"]

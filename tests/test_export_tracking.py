@@ -21,7 +21,7 @@ from recorded import record
 import torchfilm as tf
 from torchfilm.cli.export import Export
 from torchfilm.io import cell_tracking, new_file
-from torchfilm.io.cell_tracking import Tracks, _warn_of
+from torchfilm.io.cell_tracking import LabelTracks, _warn_of
 
 tifffile = pytest.importorskip("tifffile", reason="the extra images")
 PIXEL = 0.1
@@ -227,15 +227,15 @@ def family(count: int) -> SimpleNamespace:
 
 
 def test_16_bits_hold_65535_labels():
-    full = Tracks(family(65535), 0)
+    full = LabelTracks(family(65535), 0)
     assert full.labels(np.arange(65535), 0) == [*range(1, 65536)]
     full.labels(np.arange(1, 65535), 1)
     with pytest.raises(tf.InputError, match=r"colony 0 needs more than 65535 labels by frame 2"):
         full.labels(np.arange(65535), 2)  # cell 0 has come back
-    assert Tracks(family(65535), 0).labels(np.array([65534]), 0) == [65535]
-    many = Tracks(family(65536), 0)
+    assert LabelTracks(family(65535), 0).labels(np.array([65534]), 0) == [65535]
+    many = LabelTracks(family(65536), 0)
     assert many.labels(np.arange(1, 65536), 0) == [*range(1, 65536)]  # all that there are
-    many = Tracks(family(65536), 0)
+    many = LabelTracks(family(65536), 0)
     with pytest.raises(tf.InputError, match=r"16 bits.*fewer frames.*smaller window"):
         many.labels(np.arange(65536), 0)
 

@@ -15,7 +15,7 @@ from torchfilm.pictures import figures, movies
 from torchfilm.pictures.colours import PlotStyle, paint_cells
 from torchfilm.pictures.figures import choose_frames
 from torchfilm.pictures.frames import RecordedFrames
-from torchfilm.pictures.movies import Film, _nearest, clock
+from torchfilm.pictures.movies import MovieFrames, _nearest, clock
 from torchfilm.pictures.page import plan_layout
 
 UNTIL = 2.0
@@ -305,7 +305,7 @@ def test_a_gif_shows_what_was_drawn(run, tmp_path, film_options):
         shared = plan_layout(
             frames, [0, 1], PlotStyle(channels=film_options["channels"], background="ahl")
         )
-        drawn = Film(frames, shared, "", 50)
+        drawn = MovieFrames(frames, shared, "", 50)
         for k in (0, 3, 5):
             film.seek(k)
             wanted, found = drawn[k].astype(int), np.asarray(film.convert("RGB")).astype(int)
@@ -336,7 +336,7 @@ def test_a_film_moves_neither_its_window_nor_its_legend(run, film_options):
     """Outside the panels and the titles every frame is the same."""
     with tf.Results(run) as results:
         frames = RecordedFrames(results, range(len(results)), None)
-        film = Film(frames, plan_layout(frames, [0], PlotStyle(colour="yfp")), "", 60)
+        film = MovieFrames(frames, plan_layout(frames, [0], PlotStyle(colour="yfp")), "", 60)
         first, last = film[0], film[5]
     assert first.shape == last.shape
     panel = film.axes[0].get_window_extent()
@@ -401,7 +401,7 @@ def test_an_mp4_has_every_frame(run, tmp_path, film_options):
     assert facts["fps"] == 5
     with tf.Results(run) as results:
         shown = RecordedFrames(results, range(len(results)), "ahl")
-        drawn = Film(
+        drawn = MovieFrames(
             shown,
             plan_layout(
                 shown, [0, 1], PlotStyle(channels=film_options["channels"], background="ahl")

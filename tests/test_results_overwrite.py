@@ -165,7 +165,9 @@ def test_a_run_killed_before_its_first_frame_leaves_the_old_file_and_blocks_no_o
 ):
     assert process(KILLED, old, os.path.dirname(__file__)).wait(60) == 9
     assert_same_file(whole[0], old)
-    assert replacing.beside(old).exists(), "the kill came too early; the test would prove nothing"
+    assert replacing.replacement_of(old).exists(), (
+        "the kill came too early; the test would prove nothing"
+    )
     scene = make_scene()
     record(scene, scene.bind(3, seed=11).start(), old, overwrite=True)
     assert_same_file(whole[0], old)
@@ -175,7 +177,7 @@ def test_a_run_killed_before_its_first_frame_leaves_the_old_file_and_blocks_no_o
 @pytest.mark.parametrize("left", [b"", b"\x89HDF\r\n\x1a\n", b"\x89HDF\r\n\x1a\nhalf a file"])
 def test_a_broken_file_of_an_earlier_run_is_no_hindrance(tmp_path, left):
     path, scene = tmp_path / "run.h5", make_scene()
-    replacing.beside(path).write_bytes(left)
+    replacing.replacement_of(path).write_bytes(left)
     record(scene, scene.bind().start(), path, until=0.1)
     with tf.Results(path) as results:
         assert results.steps.tolist() == [0, 2]
@@ -184,7 +186,7 @@ def test_a_broken_file_of_an_earlier_run_is_no_hindrance(tmp_path, left):
 
 def test_another_file_in_the_place_of_the_new_one_is_kept(old, whole):
     scene = make_scene()
-    with h5py.File(replacing.beside(old), "w") as file:
+    with h5py.File(replacing.replacement_of(old), "w") as file:
         file.attrs["format"] = "a study"
     with pytest.raises(tf.InputError, match=r"run\.h5\.new.*another kind of file"):
         record(scene, scene.bind().start(), old, overwrite=True)

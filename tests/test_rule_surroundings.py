@@ -338,3 +338,19 @@ def test_events_of_one_cell_do_not_depend_on_the_others(state):
     found = [of(whole, first + k) for k in range(6)]
     assert found == [of(part, k) for k in range(6)]
     assert 0 < sum(map(sum, found)) < 48
+
+
+@pytest.mark.parametrize("name", ["xy", "yx", "z"])
+def test_only_single_coordinates_have_names(name):
+    with pytest.raises(InputError, match=f"no '{name}'"):
+        scene(lambda cells: getattr(cells, name)).bind()
+
+    def declare(cells):
+        setattr(cells, name, cells.x + cells.y)
+
+    declare.__name__ = "declare"
+    own = tf.Rules(declare, variables={name: 0.0})
+    cells = tf.Cells([[1.0, 2.0]], [[1.0, 0.0]])
+    model = tf.Scene(own, tf.Growth(rate=1.0), dim=2, founders=cells, dt=0.05).bind()
+    state = model.step(model.start())
+    assert float(state.fields[name][0]) == 3.0

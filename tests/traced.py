@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import torchfilm as tf
 from torchfilm import parts
 from torchfilm.circuits import compiled, emission
-from torchfilm.circuits.emission import Equations
+from torchfilm.circuits.emission import RateExpressions
 from torchfilm.circuits.expressions import Builder
 from torchfilm.circuits.graph import evaluated
 from torchfilm.circuits.tracing import Column, lowered
@@ -86,7 +86,7 @@ def emitted(function: Callable, **columns: torch.Tensor) -> np.ndarray:
     }
     (simple,) = lowered([found.expression], leaves, builder)
     kinds = {n: (x.dtype, x.dim()) for n, x in columns.items()}
-    equations = Equations((simple.expression,), ("x",), kinds, builder)
+    equations = RateExpressions((simple.expression,), ("x",), kinds, builder)
     text = compiled.HEAD.format(what="one rate", constants="") + emission.functions(equations)[0]
     module = plain_module(text + "def run():\n    pass\n")
     out = []

@@ -64,7 +64,7 @@ class Spending(Timings):
 
 
 @dataclass(frozen=True)
-class Block:
+class ProbeSteps:
     """A few steps of a probe.
 
     cells: mean number in all colonies. seconds: median of a step, by effect. bytes: what one step
@@ -104,7 +104,7 @@ class CostProbe:
     """
 
     model: Model
-    blocks: list[Block]
+    blocks: list[ProbeSteps]
     first: State
     last: State
     failed: str
@@ -191,11 +191,13 @@ def _warm_up(model: Model, state: State, seconds: float) -> None:
 
 
 @torch.no_grad()
-def _watched(model: Model, state: State, most: int, end: float) -> tuple[list[Block], State, str]:
+def _watched(
+    model: Model, state: State, most: int, end: float
+) -> tuple[list[ProbeSteps], State, str]:
     """Runs blocks of steps, at least one, until there are `most`, or enough cells, or the clock
     reaches `end`. Returns the blocks, the last state, and why a step failed, or ""."""
     state = model.step(state)  # what is worked out once for a batch is untimed
-    blocks: list[Block] = []
+    blocks: list[ProbeSteps] = []
     counted, broken = 0, failures(state)
     while not broken and (
         not blocks
@@ -223,7 +225,7 @@ def _watched(model: Model, state: State, most: int, end: float) -> tuple[list[Bl
             counted = state.cells
             state = model.step(state, timings=spent)
         medians = {title: float(np.median([t[title] for t in taken])) for title in taken[0]}
-        blocks.append(Block(float(np.mean(counts)), state.colonies, medians, spent.bytes))
+        blocks.append(ProbeSteps(float(np.mean(counts)), state.colonies, medians, spent.bytes))
     return blocks, state, broken[0].reason if broken else ""
 
 

@@ -15,8 +15,6 @@ from torchfilm.physics.space import checked_spans
 from torchfilm.state import State
 from torchfilm.tools import checks
 
-AXES = "xyz"
-
 
 @dataclass(frozen=True)
 class Film:
@@ -49,7 +47,7 @@ class Floor:
     ) -> Floor:  # fmt: skip
         """The floor of a state's colonies. across: see `measure.film`. of_medium: whether it may be
         as wide as the box of the medium. Raises InputError, which names `name`."""
-        ground, upward = AXES[: state.dim - 1], AXES[state.dim - 1]
+        ground, upward = "xyz"[: state.dim - 1], "xyz"[state.dim - 1]
         faces = {} if state.space is None else state.space.faces
         if upward in faces:
             raise checks.InputError(
@@ -82,7 +80,7 @@ class Floor:
 
 
 @dataclass(frozen=True, eq=False)
-class Columns:
+class CellsOverColumns:
     """Where cells meet the middles of columns. place: (M,), the column, of all colonies one after
     the other. cell: (M,). top: (M,) float64, how high the cell reaches there, µm above the floor.
     inside: (N,) bool, whether a cell's centre is above the floor, in a column of it. size: how many
@@ -134,7 +132,7 @@ def below_top_of(
     return torch.where(there, top - above, math.nan)
 
 
-def columns_of(state: State, floor: Floor) -> Columns:
+def columns_of(state: State, floor: Floor) -> CellsOverColumns:
     """Where the cells of a state meet the columns of a floor, above it."""
     half, radius, axis = 0.5 * state.length.double(), state.radius.double(), state.axis.double()
     inside = state.position[:, -1] >= floor.at
@@ -161,7 +159,7 @@ def columns_of(state: State, floor: Floor) -> Columns:
     top = pick(state.position[:, -1]) + _top(away, pick(axis), pick(half), pick(radius)) - floor.at
     meets = torch.nonzero(there & (top > 0)).squeeze(1)  # a NaN is not above 0
     size = state.colonies * math.prod(floor.counts)
-    return Columns(place[meets], cell[meets], top[meets], inside, size)
+    return CellsOverColumns(place[meets], cell[meets], top[meets], inside, size)
 
 
 def _top(away: Sequence[Tensor], axis: Tensor, half: Tensor, radius: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from torchfilm.tools.ragged import Groups
 from torchfilm.tools.threads import one_torch_thread
 
 
-class Surroundings:
+class SurroundingsView:
     """The methods of `CellsView` that look beyond the cell."""
 
     _state: State

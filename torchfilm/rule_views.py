@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchfilm.circuits.names import Names
 from torchfilm.rule_draws import Draws, OneCell, StepDraws
-from torchfilm.rule_surroundings import Surroundings
+from torchfilm.rule_surroundings import SurroundingsView
 from torchfilm.rule_values import (
     REMOVED_LATER,
     RuleError,
@@ -32,7 +32,6 @@ PAPER_NAMES = {
     "growthRate": "growth_rate",
     "divideFlag": "divide_flag",
 }
-AXES = "xyz"
 GEOMETRY = ("position", "axis", "length", "radius", "volume", "area")
 # The fields of other effects that a read of a name depends on.
 MEANS = {
@@ -75,7 +74,7 @@ def _known_names(state: State) -> list[str]:
     return [*GEOMETRY, *IDENTITY, *fields]
 
 
-class CellsView(StepDraws, Surroundings):
+class CellsView(StepDraws, SurroundingsView):
     """The cells as a rule sees them: every name is a tensor over all cells, (N,) or (N, d).
 
     `for cell in cells` gives them one by one (slow). A rule may read position (pos; x, y, z), axis
@@ -162,8 +161,8 @@ class CellsView(StepDraws, Surroundings):
             self._read.add(name)
             # a copy, so that a rule may write into it: states are frozen
             self._work[name] = state.fields[name].clone()
-        elif name in AXES[: state.dim]:
-            return self.position[:, AXES.index(name)]
+        elif name in tuple("xyz"[: state.dim]):
+            return self.position[:, "xyz".index(name)]
         elif self._declaring and name in KNOWN_FIELDS:
             self._work[name] = KNOWN_FIELDS[name].start(
                 state, torch.arange(state.cells, device=state.device)
@@ -184,7 +183,7 @@ class CellsView(StepDraws, Surroundings):
     def _more_names(self) -> list[str]:
         """What else stands after `cells.`: flags, methods, and names of the paper."""
         methods = [n for n in dir(type(self)) if not n.startswith("_")]
-        return [*PAPER_NAMES, *AXES[: self._state.dim], "remove_flag", *methods]
+        return [*PAPER_NAMES, *"xyz"[: self._state.dim], "remove_flag", *methods]
 
     def _signals(self) -> Names:
         """The concentration of each signal at each cell, (N,) by name: `cells.signals.ahl`."""
@@ -210,7 +209,7 @@ class CellsView(StepDraws, Surroundings):
         if (
             of_colony
             or name in (*GEOMETRY, *IDENTITY, "signals")
-            or (name in AXES[: state.dim] and name not in state.fields)
+            or (name in tuple("xyz"[: state.dim]) and name not in state.fields)
             or isinstance(getattr(type(self), name, None), property)
         ):
             raise RuleError(
@@ -338,8 +337,8 @@ class DivisionView(Draws):
         if name == "p" and self._constants is not None:
             return self._constants()
         if name not in self._work:
-            if name in AXES[: self._state.dim] and name not in self._state.fields:
-                return self.position[:, AXES.index(name)]
+            if name in tuple("xyz"[: self._state.dim]) and name not in self._state.fields:
+                return self.position[:, "xyz".index(name)]
             if not (name in GEOMETRY or name in IDENTITY or name in self._state.fields):
                 known = _known_names(self._state)
                 if hasattr(CellsView, name):

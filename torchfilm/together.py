@@ -23,7 +23,7 @@ from torchfilm.effects.bound_medium import BoundMedium
 from torchfilm.effects.circuit_kernels import PreparedStep
 from torchfilm.effects.circuit_report import Failures
 from torchfilm.medium_exchange import MediumExchange, Ramped
-from torchfilm.signals.joint import JointTransport, Moved
+from torchfilm.signals.joint import JointMove, JointTransport
 from torchfilm.state import CELL, GRID, OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.fixed_point import DEPTH, FixedPoint, fixed_point, with_derivative
@@ -64,7 +64,7 @@ class Outcome:
 
     state: State
     released: dict[str, Tensor]
-    moved: dict[str, Moved]
+    moved: dict[str, JointMove]
     reports: list[Failures]
 
     def tracked(self, before: State) -> bool:
@@ -384,7 +384,7 @@ class _Iteration:
         self.going = torch.ones(colonies, dtype=torch.bool)
         self.far = torch.zeros(colonies, dtype=torch.bool)
 
-    def moved(self, made: PreparedStep) -> dict[str, Moved]:
+    def moved(self, made: PreparedStep) -> dict[str, JointMove]:
         """The signals, for what cells have just released."""
         out, given = {}, dict(zip(made.names, made.released, strict=True))
         none = np.zeros(len(self.x))

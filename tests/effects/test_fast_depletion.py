@@ -143,6 +143,6 @@ def test_which_colonies_are_coarse(batches):
         groups=Groups(torch.arange(5), 5, ordered=True), field=before, grid=grid, finest=1e-6,
         _far=[far[k] for k in places],
     )  # fmt: skip
-    moved = joint.Moved(after, taken, taken, taken)
+    moved = joint.JointMove(after, taken, taken, taken)
     found = joint.JointTransport.coarse(given, moved)
     assert found.tolist() == [True, False, True, False, False]

@@ -14,7 +14,7 @@ from test_operator import BOUNDARIES, SPACING, dense
 from torchfilm.signals import uptake
 from torchfilm.signals.exchange import stencil
 from torchfilm.signals.grid import Grid
-from torchfilm.signals.joint import JointTransport, Moved, _parted
+from torchfilm.signals.joint import JointMove, JointTransport, _parted
 from torchfilm.signals.transport_rates import build_operator
 from torchfilm.signals.transport_uptake import EVENTS, UptakeTransport
 from torchfilm.signals.uptake import Eaters, solve
@@ -238,7 +238,7 @@ def test_what_cells_took_too_much_of_is_taken_from_their_colony():
     apart[owner == 0], apart[owner == 1], apart[owner == 2] = -2.0, -40.0, -1e-3
     wanted = torch.full_like(apart, -50.0)
     taken = torch.where(made.fed, apart - wanted, 0.0)  # none beyond the box
-    moved = Moved(made.field, made.found, made.found, taken)
+    moved = JointMove(made.field, made.found, made.found, taken)
     end, beyond, left = joint.settled(moved, wanted)
     sums = lambda x, own: torch.zeros(5, dtype=F64).index_add(0, own, x)
     before, after = (sums(x * volume, made.grid.owner) for x in (made.field, end))

@@ -14,7 +14,7 @@ from torchfilm.cellmodeller.loading import SECONDS, Script, importing, load
 from torchfilm.cellmodeller.rates import SIGNAL, SPECIES, TextRates
 from torchfilm.cellmodeller.rehearsal import rehearse
 from torchfilm.cellmodeller.script_rules import ScriptRules
-from torchfilm.cellmodeller.sheets import Layout
+from torchfilm.cellmodeller.sheets import CellLayout
 from torchfilm.cellmodeller.stand_ins import LENGTH, RADIUS
 from torchfilm.effect import Effect
 from torchfilm.effects.circuit import Circuit
@@ -107,7 +107,7 @@ def script_rules(script: Script, loop: str, founders: Cells | None = None) -> Sc
     options = script.request.options or {}
     species = checks.integer("nSpecies", integrator["species"], least=1) if integrator else 0
     signals = checks.integer("nSignals", grid["signals"], least=1) if grid else 0
-    bare = Layout({}, species, signals, bool(options.get("compNeighbours")))
+    bare = CellLayout({}, species, signals, bool(options.get("compNeighbours")))
     layout, first = rehearse(script, bare, founders)
     rule, reason = None, "--set loop=cells"
     if loop != "cells":
@@ -128,7 +128,7 @@ def script_rules(script: Script, loop: str, founders: Cells | None = None) -> Sc
     return ScriptRules(script.path.name, digest(script.text), used, reason, script, layout, rule)
 
 
-def _column_rule(script: Script, layout: Layout, first: State) -> ColumnRule:
+def _column_rule(script: Script, layout: CellLayout, first: State) -> ColumnRule:
     """The rule on whole columns, tried on first cells. Raises Uneven if there is none."""
     rule = ColumnRule(script.text, script.module, layout)
     if script.mentions("deathFlag"):

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.cellmodeller.cell import READ_ONLY
-from torchfilm.cellmodeller.sheets import Layout, check_growth, found_signals
+from torchfilm.cellmodeller.sheets import CellLayout, check_growth, found_signals
 from torchfilm.cellmodeller.variables import FIELDS
 from torchfilm.state import State
 
@@ -80,7 +80,7 @@ FUNCTIONS: dict[Any, Callable[..., Any]] = {
 class ColumnRule:
     """`update(cells)` on whole columns. Made from the source; Uneven if it is not plain."""
 
-    def __init__(self, text: str, module: ModuleType, layout: Layout):
+    def __init__(self, text: str, module: ModuleType, layout: CellLayout):
         found = [n for n in ast.parse(text).body if isinstance(n, ast.FunctionDef)]
         made = [n for n in found if n.name == "update"]
         code = getattr(getattr(module, "update", None), "__code__", None)

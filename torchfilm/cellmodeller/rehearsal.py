@@ -12,14 +12,14 @@ from torchfilm.cellmodeller import draws
 from torchfilm.cellmodeller.cell import READ_ONLY, Cell, written
 from torchfilm.cellmodeller.globals_watch import GlobalsWatch
 from torchfilm.cellmodeller.loading import Script, importing
-from torchfilm.cellmodeller.sheets import Layout, first_fields, sheet_of, with_written
+from torchfilm.cellmodeller.sheets import CellLayout, first_fields, sheet_of, with_written
 from torchfilm.cellmodeller.variables import COLOR, FIELDS, GREY, HISTORY, Variable, variable
 from torchfilm.initial_cells import Cells
 from torchfilm.state import State
 from torchfilm.tools.checks import InputError
 
 
-def rehearse(script: Script, bare: Layout, founders: Cells) -> tuple[Layout, State]:
+def rehearse(script: Script, bare: CellLayout, founders: Cells) -> tuple[CellLayout, State]:
     """The layout with the script's variables, which `init`, `update` and `divide` set on copies of
     the first cells, and these cells after `init`. Global variables are as before afterwards."""
     state = founders.state(1, 0, torch.device("cpu"), torch.float32)
@@ -27,7 +27,7 @@ def rehearse(script: Script, bare: Layout, founders: Cells) -> tuple[Layout, Sta
     if any(script.mentions(n) for n in HISTORY):  # these need each other
         named = {n: variable(n, [0 if n == "cellAge" else 0.0]) for n in HISTORY}
     state = _with_first(state, named)
-    known = Layout(named, bare.species, bare.signals, bare.neighbours)
+    known = CellLayout(named, bare.species, bare.signals, bare.neighbours)
     sheet = sheet_of(state, known)
     cells = {k + 1: Cell(sheet, k) for k in range(state.cells)}
     everyone = list(cells.values())
@@ -51,7 +51,7 @@ def rehearse(script: Script, bare: Layout, founders: Cells) -> tuple[Layout, Sta
     if not script.mentions(COLOR):
         del found[COLOR]
     variables = {**named, **_variables(script, found, named, bare)}
-    layout = Layout(variables, bare.species, bare.signals, bare.neighbours)
+    layout = CellLayout(variables, bare.species, bare.signals, bare.neighbours)
     return layout, _first_state(state, layout, first)
 
 
@@ -61,7 +61,7 @@ def _copied(cell: Cell) -> Cell:
     return made
 
 
-def _first_state(state: State, layout: Layout, first: Sequence[dict[str, Any]]) -> State:
+def _first_state(state: State, layout: CellLayout, first: Sequence[dict[str, Any]]) -> State:
     """The first cells with what `init` has set."""
     for field in first_fields(layout):
         if field.name not in state.fields:
@@ -95,7 +95,7 @@ def _rehearsed(script: Script, name: str, calls: Sequence[list[Any]], cells: lis
 
 
 def _variables(
-    script: Script, found: dict[str, list[Any]], named: dict[str, Variable], bare: Layout
+    script: Script, found: dict[str, list[Any]], named: dict[str, Variable], bare: CellLayout
 ) -> dict[str, Variable]:
     """The variables among all that the script has set."""
     others = {*READ_ONLY, *FIELDS, *named, "deathFlag"}

@@ -10,7 +10,7 @@ from typing import Any
 from torchfilm.cellmodeller.bound_script import BoundScript, ScriptDivision
 from torchfilm.cellmodeller.columns import ColumnRule
 from torchfilm.cellmodeller.loading import Script
-from torchfilm.cellmodeller.sheets import Layout
+from torchfilm.cellmodeller.sheets import CellLayout
 from torchfilm.effect import RULES, Binding, BoundEffect, Effect
 from torchfilm.state import CELL_TYPE, Field, State
 
@@ -29,7 +29,7 @@ class ScriptRules(Effect):
     loop: str
     reason: str = field(repr=False)
     script: Script = field(repr=False)
-    layout: Layout = field(repr=False)
+    layout: CellLayout = field(repr=False)
     rule: ColumnRule | None = field(repr=False)
 
     stage = RULES

@@ -26,7 +26,7 @@ SHARES = (
 
 
 @dataclass(frozen=True)
-class Layout:
+class CellLayout:
     """What cells of a script have. variables by name; species, signals: how many; neighbours:
     whether contacts are listed (CLBacterium(compNeighbours=True))."""
 
@@ -43,7 +43,7 @@ class Layout:
         return [SPECIES.format(k) for k in range(self.species)]
 
 
-def sheet_of(state: State, layout: Layout, rows: Tensor | None = None) -> Sheet:
+def sheet_of(state: State, layout: CellLayout, rows: Tensor | None = None) -> Sheet:
     """The sheet of all cells, or of the cells `rows` (M,)."""
     reader = _Reader(state, layout, rows)
     levels = {"species": reader.species} if layout.species else {}
@@ -55,7 +55,7 @@ def sheet_of(state: State, layout: Layout, rows: Tensor | None = None) -> Sheet:
 class _Reader:
     """Reads columns of a state by the names of CellModeller."""
 
-    def __init__(self, state: State, layout: Layout, rows: Tensor | None):
+    def __init__(self, state: State, layout: CellLayout, rows: Tensor | None):
         self.state, self.layout, self.rows = state, layout, rows
         self.count = state.cells if rows is None else rows.numel()
 
@@ -164,7 +164,7 @@ class _Reader:
         return torch.stack(each, 1).detach().cpu().numpy().astype(np.float64)
 
 
-def found_signals(state: State, layout: Layout) -> list[Tensor]:
+def found_signals(state: State, layout: CellLayout) -> list[Tensor]:
     """The concentration of each signal at each cell, (N,); 0 before the medium is laid."""
     contact = state.contact()
     if contact is None:
@@ -172,7 +172,7 @@ def found_signals(state: State, layout: Layout) -> list[Tensor]:
     return [contact.found[SIGNAL.format(k)] for k in range(layout.signals)]
 
 
-def first_fields(layout: Layout) -> list[Field]:
+def first_fields(layout: CellLayout) -> list[Field]:
     """The fields in which a script's cells begin; the scene's effects declare them again."""
     return [
         CELL_TYPE,
@@ -184,7 +184,11 @@ def first_fields(layout: Layout) -> list[Field]:
 
 
 def with_written(
-    state: State, layout: Layout, sheet: Sheet, cells: Sequence[Cell], rows: Tensor | None = None
+    state: State,
+    layout: CellLayout,
+    sheet: Sheet,
+    cells: Sequence[Cell],
+    rows: Tensor | None = None,
 ) -> tuple[State, Tensor | None]:
     """The state with what a script has set in cells, and which cells it has marked as dead (N,), or
     None. rows: of the sheet's cells in the state."""

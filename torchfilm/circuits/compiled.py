@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.circuits.emission import Equations, Functions, as_tuple
+from torchfilm.circuits.emission import Functions, RateExpressions, as_tuple
 from torchfilm.circuits.expressions import NAME, NUMBER, Builder, Expression, walk
 from torchfilm.circuits.graph import Leaves, traced_rates
 from torchfilm.circuits.names import Names
@@ -35,7 +35,7 @@ _compiled: set[str] = set()  # modules that this process has run
 class Compiled:
     """Equations of a circuit in cells of one type, and the functions compiled from them."""
 
-    equations: Equations
+    equations: RateExpressions
     literals: Mapping[str, float]  # numbers in the rates, by the names that stand for them
     columns: tuple[str, ...]  # names that have a number for each cell
     numbers: tuple[str, ...]  # names that have one number
@@ -225,12 +225,12 @@ class Trace:
 
     def equations(
         self, rates: Sequence[Column]
-    ) -> tuple[Equations, dict[str, float], tuple[str, ...], tuple[str, ...]]:
+    ) -> tuple[RateExpressions, dict[str, float], tuple[str, ...], tuple[str, ...]]:
         """As `Compiled` has them. Raises Untraceable where an operation has no compiled form."""
         literals, made = _without_literals([x.expression for x in rates], self.builder)
         kinds = self.kinds | dict.fromkeys(literals)
         read = {e.name for e in walk(made) if e.op == NAME} | set(self.variables)
-        equations = Equations(
+        equations = RateExpressions(
             made, tuple(self.variables), {n: k for n, k in kinds.items() if n in read}, self.builder
         )
         Functions(equations).values()  # raises
@@ -240,7 +240,7 @@ class Trace:
 
 def rates_of(
     circuit: CircuitCells, dtype: torch.dtype
-) -> tuple[Equations, dict[str, float], tuple[str, ...], tuple[str, ...]]:
+) -> tuple[RateExpressions, dict[str, float], tuple[str, ...], tuple[str, ...]]:
     """du/dt of all variables, as `CircuitCells.rates` has them, in a type. Raises Untraceable."""
     variables = [f"u.{n}" for n in circuit.species] + [f"s.{n}" for n in circuit.exchanged]
     trace = Trace(circuit, variables, dtype)

@@ -42,7 +42,7 @@ CALLS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Equations:
+class RateExpressions:
     """du/dt of V variables, as simple operations.
 
     rates: V expressions. variables: the name of each variable. kinds: the kind of every name that
@@ -72,7 +72,7 @@ class Equations:
 class Emitter:
     """Writes expressions as lines of assignments, for numbers and for vectors (kernels.vectors)."""
 
-    def __init__(self, equations: Equations, roots: Iterable[Expression]):
+    def __init__(self, equations: RateExpressions, roots: Iterable[Expression]):
         self.equations = equations
         # what is held in float64, whatever its own type
         self.held: frozenset[Expression] = frozenset()
@@ -218,7 +218,7 @@ class Functions:
     """The text of the functions of some equations: `prepared`, and of variables u and what was
     prepared, `rates`. more: further expressions that functions return."""
 
-    def __init__(self, equations: Equations, more: Iterable[Expression] = ()):
+    def __init__(self, equations: RateExpressions, more: Iterable[Expression] = ()):
         roots = [*equations.rates, *more]
         self.equations, self.emitter = equations, Emitter(equations, roots)
         self.hoisted = self.emitter.constants(roots)
@@ -248,7 +248,7 @@ class Functions:
         return unpack + self.emitter.lines(roots, [*self.hoisted, *variables])
 
 
-def functions(equations: Equations) -> tuple[str, int]:
+def functions(equations: RateExpressions) -> tuple[str, int]:
     """The text of `prepared`, `rates`, `linearised`, `times_slopes`, `factored`, `solved`; how many
     numbers are prepared."""
     slopes = equations.slopes()
@@ -262,7 +262,7 @@ def functions(equations: Equations) -> tuple[str, int]:
     return text + _linear(Pattern.of(len(equations.variables), order)), len(made.hoisted)
 
 
-def tangent_functions(equations: Equations, moving: Sequence[str]) -> str:
+def tangent_functions(equations: RateExpressions, moving: Sequence[str]) -> str:
     """The text of `rates_moved` and `linearised_moved`: the tangents of the rates, and of their
     slopes in the order of `linearised`, for the tangents t of the variables and `turn` of the
     leaves `moving`."""
@@ -274,7 +274,7 @@ def tangent_functions(equations: Equations, moving: Sequence[str]) -> str:
     rates = [tangents(b, equations.rates, of).get(r, at_rest) for r in equations.rates]
     bent = tangents(b, slopes.values(), of)
     turned = [bent.get(slopes[k], at_rest) for k in sorted(slopes)]
-    emitter = Emitter(Equations(equations.rates, names, kinds, b), [*rates, *turned])
+    emitter = Emitter(RateExpressions(equations.rates, names, kinds, b), [*rates, *turned])
     lines = [f"{as_tuple([f'u{k}' for k in range(len(names))])} = u"]
     lines += emitter.unpacked([b.name(n) for n in equations.leaves], "leaf")
     lines += emitter.unpacked([named[n] for n in names], "t")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import REMOVAL, Effect
-from torchfilm.film_shape import Columns, Floor, columns_of
+from torchfilm.film_shape import CellsOverColumns, Floor, columns_of
 from torchfilm.reports import CellsLost
 from torchfilm.resolver import Values
 from torchfilm.signals.schedule import warn_of_means
@@ -145,7 +145,7 @@ class Erosion(Effect):
 class _Stacks:
     """The cells of each column, from the highest down, and which of them is on top."""
 
-    def __init__(self, columns: Columns):
+    def __init__(self, columns: CellsOverColumns):
         order = order_within(columns.place, columns.top, descending=True)
         # and one more, for columns in which there is none
         self._cells = torch.cat([columns.cell[order], columns.cell.new_zeros(1)])

@@ -22,7 +22,12 @@ from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
 from torchfilm.parameters import number_range
 from torchfilm.physics.adhesion import Adhesion, check_walls_of
 from torchfilm.physics.contact_records import ContactSettings
-from torchfilm.physics.initial_overlaps import check_apart, check_fits, check_room, check_turned
+from torchfilm.physics.initial_overlaps import (
+    check_apart,
+    check_between_planes,
+    check_fits,
+    check_turned,
+)
 from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.space import PeriodicSpace, check_first_cells, check_walls_in
 from torchfilm.physics.surfaces import Surface
@@ -283,7 +288,7 @@ class Mechanics(Effect):
         if wrong := self.behind(state, self.surfaces()):
             raise checks.InputError(wrong)
         cells, ids = (state.position, state.axis, state.length, state.radius), state.own_colony_id
-        check_room(self.surfaces(), state.position, state.radius, ids)
+        check_between_planes(self.surfaces(), state.position, state.radius, ids)
         if check_fits(self.surfaces(), state.position, *cells[2:], ids, state.uid):
             check_turned(self.surfaces(), *cells, ids, state.uid)
         check_apart(*cells, state.colony, state.colony_id, state.uid, space)

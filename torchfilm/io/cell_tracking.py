@@ -50,7 +50,7 @@ class Track:
     parent: int
 
 
-class Tracks:
+class LabelTracks:
     """The tracks of a colony, made frame after frame.
 
     A label is the number of the cell plus 1. A cell that has had no pixel for a while goes on under
@@ -120,7 +120,7 @@ def write_ctc(
     target = check_new_folder(path, (IMAGES, TRUTH, CELLS), FILES, overwrite)
     checks.choice("profile", profile, PROFILES)
     images = _images(view, channels, profile, camera)
-    tracks, number = Tracks(view.tables.lineage, view.colony), _numbers(len(view.frames))
+    tracks, number = LabelTracks(view.tables.lineage, view.colony), _numbers(len(view.frames))
     with folder_written_whole(target) as folder:
         tra, seg = folder / TRUTH / "TRA", folder / TRUTH / "SEG"
         for part in (tra, seg, *([] if images is None else [folder / IMAGES])):
@@ -144,7 +144,7 @@ def _numbers(count: int) -> list[str]:
     return [f"{k:0{digits}}" for k in range(count)]
 
 
-def _masks(view: View, tracks: Tracks) -> Iterator[np.ndarray]:
+def _masks(view: View, tracks: LabelTracks) -> Iterator[np.ndarray]:
     """The mask (rows, columns) of each frame. Warns at the end of cells without pixels and of
     frames without cells. Raises InputError where there is no cell at all."""
     hidden: list[tuple[int, int]] = []

@@ -77,7 +77,7 @@ class Recorder(metaclass=checks.KnownKeywords):
         self._check_path()
         # where a link leads; the path itself may be relative to a folder that the process leaves
         self.target = self.path.resolve()
-        self.source = replacing.beside(self.target)
+        self.source = replacing.replacement_of(self.target)
         self.file: h5py.File | None = None
         self.dt = scene.dt
         self.model: Model | None = None

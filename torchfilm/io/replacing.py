@@ -30,7 +30,7 @@ JUST_MADE = 0.2  # s, by when a file that a process has created is locked
 CHUNKS_AT_ONCE = 16  # that are copied: whole ones, so that each is compressed once
 
 
-def beside(path: Path) -> Path:
+def replacement_of(path: Path) -> Path:
     """Where the new file is written until it replaces the one at `path`."""
     return path.with_name(path.name + ".new")
 

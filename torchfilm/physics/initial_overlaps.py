@@ -74,7 +74,9 @@ def check_apart(
 
 
 @torch.no_grad()
-def check_room(surfaces: Sequence[Surface], position: Tensor, radius: Tensor, ids: Tensor) -> None:
+def check_between_planes(
+    surfaces: Sequence[Surface], position: Tensor, radius: Tensor, ids: Tensor
+) -> None:
     """Warn where a cell is wider than what two hard, parallel planes leave it.
 
     position (N, d); radius (N,) µm; ids (N,), of the cells' colonies.
@@ -151,7 +153,7 @@ def check_turned(
         turned = axis.T.double()
         across = (turned - (way * turned).sum(0) * way).norm(dim=0) < ACROSS
         jammed = opposite & across & (length + 2 * radius > width * (1 + 1e-6))
-        jammed &= 2 * radius <= width * (1 + 1e-6)  # of wider ones `check_room` warns
+        jammed &= 2 * radius <= width * (1 + 1e-6)  # of wider ones `check_between_planes` warns
         if bool(jammed.any()):
             k, names = int(torch.nonzero(jammed)[0]), (type(s.wall).__name__ for s in (one, other))
             warn(

@@ -18,7 +18,6 @@ from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.reads import rows_where
 
-AXES = "xyz"
 Faces = Mapping[str, tuple[float, float]]  # (low, high) µm by axis
 
 
@@ -56,7 +55,7 @@ class PeriodicSpace:
         """From {"x": (low, high), …}; None of no axis. Raises InputError, which names `name`."""
         if given is None:
             return None
-        faces, axes = checked_spans(name, given, AXES[:dim]), AXES[:dim]
+        faces, axes = checked_spans(name, given, "xyz"[:dim]), "xyz"[:dim]
         low, high = ([faces.get(a, (0.0, 0.0))[end] for a in axes] for end in (0, 1))
         return PeriodicSpace(tuple(low), tuple(high)) if faces else None
 
@@ -68,7 +67,7 @@ class PeriodicSpace:
     @cached_property
     def faces(self) -> dict[str, tuple[float, float]]:
         """The faces of each periodic axis, µm, as they are given."""
-        each = zip(AXES, self.low, self.high, strict=False)
+        each = zip("xyz", self.low, self.high, strict=False)
         return {axis: (low, high) for axis, low, high in each if high > low}
 
     @property
@@ -220,7 +219,7 @@ def check_walls_in(space: PeriodicSpace, surfaces: Sequence[Surface]) -> None:
         wall, across = type(surface.wall).__name__, list(space.faces)
         if isinstance(surface, FlatSurface):
             normal = [torch.as_tensor(x).detach() for x in surface.normal]
-            across = [a for a in across if bool((normal[AXES.index(a)].abs() > 1e-12).any())]
+            across = [a for a in across if bool((normal["xyz".index(a)].abs() > 1e-12).any())]
         if across:
             raise checks.InputError(
                 f"Mechanics.periodic: the {wall} ends space along {' and '.join(across)}, which is"

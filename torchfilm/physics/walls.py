@@ -21,8 +21,6 @@ from torchfilm.physics.surfaces import FlatSurface, RoundSurface, Surface, Vecto
 from torchfilm.tools import checks
 from torchfilm.tools.one_per_colony import Kept
 
-AXES = "xyz"
-
 
 @dataclass(frozen=True)
 class Wall(metaclass=checks.KnownKeywords):
@@ -123,7 +121,7 @@ class Plane(Wall):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        named = [a for a in AXES if getattr(self, a) is not None]
+        named = [a for a in "xyz" if getattr(self, a) is not None]
         if (self.point is None) != (self.normal is None):
             raise checks.InputError(
                 "Plane needs both point and normal, or neither. Example: Plane(point=(0, 0),"
@@ -174,15 +172,15 @@ class Plane(Wall):
             )
             normal = tuple(n / size for n in normal)
             return [FlatSurface(self, normal, _inner(point, normal))]
-        axis = next(k for k, a in enumerate(AXES) if getattr(self, a) is not None)
+        axis = next(k for k, a in enumerate("xyz") if getattr(self, a) is not None)
         if axis >= dim:
             raise checks.input_error(
-                f"Plane.{AXES[axis]}",
-                getattr(self, AXES[axis]),
-                f"a position along {' or '.join(AXES[:dim])}: the scene is {dim}-D",
+                f"Plane.{'xyz'[axis]}",
+                getattr(self, "xyz"[axis]),
+                f"a position along {' or '.join('xyz'[:dim])}: the scene is {dim}-D",
             )
         sign = 1.0 if self.facing[0] == "+" else -1.0  # type: ignore[index]
-        at = getattr(self, AXES[axis])
+        at = getattr(self, "xyz"[axis])
         return [FlatSurface(self, tuple(sign if k == axis else 0.0 for k in range(dim)), sign * at)]
 
 
@@ -296,7 +294,7 @@ def _sides(
     dim, out = len(low), list[Surface]()
     for k, pair in enumerate(zip(low, high, strict=True)):
         if any(isinstance(x, Tensor) for x in pair) and not checks.below(*pair):
-            name = f"walls of {type(wall).__name__} along {AXES[k]}"
+            name = f"walls of {type(wall).__name__} along {'xyz'[k]}"
             raise checks.input_error(name, pair, "low < high", "This wall is inside out.")
         for sign, at in zip((1.0, -1.0), pair, strict=True):
             if isinstance(at, Tensor) or math.isfinite(at):

@@ -78,11 +78,11 @@ def movie(
         )
         layout = plan_layout(frames, places, style)
         with written_whole(target) as beside:
-            write(beside, Film(frames, layout, f"{view_note(style)}{more}", dpi), fps)
+            write(beside, MovieFrames(frames, layout, f"{view_note(style)}{more}", dpi), fps)
     return target
 
 
-class Film(Sequence[np.ndarray]):
+class MovieFrames(Sequence[np.ndarray]):
     """The frames of a film, each drawn on access: (height, width, 3) uint8."""
 
     def __init__(self, frames: RecordedFrames, layout: PanelLayout, more: str, dpi: float):
@@ -113,7 +113,7 @@ def clock(times: np.ndarray) -> list[str]:
     return words
 
 
-def _writer(target: Path, fps: float) -> Callable[[Path, Film, float], None]:
+def _writer(target: Path, fps: float) -> Callable[[Path, MovieFrames, float], None]:
     """The writer for this kind of film; raises InputError before anything is drawn."""
     kind = target.suffix.lower()
     if kind not in (".mp4", ".gif"):
@@ -140,7 +140,7 @@ def _writer(target: Path, fps: float) -> Callable[[Path, Film, float], None]:
     return _mp4
 
 
-def _mp4(path: Path, film: Film, fps: float) -> None:
+def _mp4(path: Path, film: MovieFrames, fps: float) -> None:
     import imageio_ffmpeg
 
     size = film.canvas.get_width_height()
@@ -164,7 +164,7 @@ def _mp4(path: Path, film: Film, fps: float) -> None:
         raise OSError(f"ffmpeg wrote {written} of {len(film)} frames")
 
 
-def _gif(path: Path, film: Film, fps: float) -> None:
+def _gif(path: Path, film: MovieFrames, fps: float) -> None:
     """All frames share one palette, so that a colour looks the same throughout."""
     from PIL import Image
 
@@ -186,7 +186,7 @@ def _gif(path: Path, film: Film, fps: float) -> None:
     )
 
 
-def _palette(film: Film) -> np.ndarray:
+def _palette(film: MovieFrames) -> np.ndarray:
     """The 256 colours (256, 3) uint8 of a GIF.
 
     It has greys for the signal, lines and letters, and colours of the legends and of some frames'

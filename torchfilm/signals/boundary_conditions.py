@@ -12,8 +12,6 @@ from torchfilm.signals.schedule import Schedule, checked_values
 from torchfilm.tools import checks
 from torchfilm.tools.one_per_colony import Kept
 
-AXES = "xyz"
-
 
 @dataclass(frozen=True)
 class Face(metaclass=checks.KnownKeywords):
@@ -133,7 +131,7 @@ class BoundaryConditions(metaclass=checks.KnownKeywords):
     z: Face | tuple[Face, Face] | None = None
 
     def __post_init__(self) -> None:
-        for axis in AXES:
+        for axis in "xyz":
             given = getattr(self, axis)
             if given is None:
                 continue

@@ -36,7 +36,7 @@ EMPTY = 1e15
 COARSE = 0.02
 
 
-class Moved(NamedTuple):
+class JointMove(NamedTuple):
     """end: (voxels,) float64, the signal at the end. at_end, mean: (N,) float64, what each cell
     finds of it then, and in the mean over the step. taken: (N,), what the medium gave to each."""
 
@@ -99,7 +99,7 @@ class JointTransport:
         """Whether kernels may run it, without derivatives by what there was."""
         return bool(self.operators) and may_run(self.field, self.found)
 
-    def moved(self, released: Tensor, mean: Tensor) -> Moved:
+    def moved(self, released: Tensor, mean: Tensor) -> JointMove:
         """A step. released: (N,), what each cell gives, or takes, conc·µm³. mean: (N,), the guess
         of the mean concentration about it."""
         released = released.double()
@@ -130,11 +130,11 @@ class JointTransport:
             torch.where(self.fed, self._read(self.grid.join(x)), self.found) for x in (found, means)
         )
         taken = rate * average * (self.stencil.voxel_volume * self.dt)
-        return Moved(end, at_end, average, taken)
+        return JointMove(end, at_end, average, taken)
 
-    def _by_kernels(self, released: Tensor, mean: Tensor) -> Moved:
+    def _by_kernels(self, released: Tensor, mean: Tensor) -> JointMove:
         if not has_tangent(self.field, self.found, released, mean):
-            return Moved(*compiled_uptake.move(self, released, mean, self._far))
+            return JointMove(*compiled_uptake.move(self, released, mean, self._far))
         with no_derivatives():
             plain = self._known(both(released)[0], both(mean)[0])
         average, moved = plain[2], both(self.found)[1]
@@ -144,20 +144,20 @@ class JointTransport:
         still = torch.zeros_like(at_end) if moved is None else moved
         at_end, there = (torch.where(self.fed, x, still) for x in (at_end, there))
         turns = end, at_end, there, taken
-        return Moved(*(with_tangent(x, turn) for x, turn in zip(plain, turns, strict=True)))
+        return JointMove(*(with_tangent(x, turn) for x, turn in zip(plain, turns, strict=True)))
 
-    def _known(self, released: Tensor, mean: Tensor) -> Moved:
+    def _known(self, released: Tensor, mean: Tensor) -> JointMove:
         """What kernels make of these numbers, kept for the next call: an iteration for tangents
         always asks for the same."""
         before = vars(self).get("_last")
         if before is None or not (
             torch.equal(before[0], released) and torch.equal(before[1], mean)
         ):
-            made = Moved(*compiled_uptake.move(self, released, mean, self._far))
+            made = JointMove(*compiled_uptake.move(self, released, mean, self._far))
             before = vars(self)["_last"] = released, mean, made
         return before[2]
 
-    def settled(self, moved: Moved, released: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def settled(self, moved: JointMove, released: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The signal at the end, (voxels,), to which cells have given exactly what they released,
         up to rounding; what they took beyond what there was, (B,), conc·µm³; and by how much each
         took more than transport gave it, (N,).
@@ -179,7 +179,7 @@ class JointTransport:
         end = end * kept.index_select(0, self.grid.owner)
         return end, (missing - content).clamp(min=0.0), left
 
-    def coarse(self, moved: Moved) -> Tensor:
+    def coarse(self, moved: JointMove) -> Tensor:
         """The colonies, (B,) bool, for which the step is too long: they took backward Euler, whose
         error is half the share that cells took times the share by which the content changed, and
         these are more than COARSE, in the geometric mean."""

@@ -27,7 +27,6 @@ from torchfilm.signals.schedule import Schedule
 from torchfilm.signals.transport_operator import Exchange, Operator
 from torchfilm.tools import checks
 
-AXES = "xyz"
 # Beyond this Péclet number of a voxel, diffusion against the flow is below 1e-33 of the flow, and
 # is omitted.
 STEEP_PECLET = 80.0
@@ -105,7 +104,7 @@ def _exchange(
     low, high = (flow, flow) if uniform else (flow.narrow(dim, 0, 1), flow.narrow(dim, n, 1))
     if isinstance(pair[0], Periodic) and not uniform and not torch.equal(low, high):
         raise checks.input_error(
-            f"velocity along {AXES[axis]}",
+            f"velocity along {'xyz'[axis]}",
             "two velocities at one periodic face",
             "the same at the low and the high face",
         )
@@ -124,7 +123,7 @@ def _exchange(
         rows = torch.broadcast_shapes(*(x.shape[:1] for x in (ends[0][k], middle, ends[1][k])))
         whole = [x.expand(*rows, *x.shape[1:]) for x in (ends[0][k], middle, ends[1][k])]
         parts.append(torch.cat(whole, dim))
-    name = f"value at a face along {AXES[axis]}"
+    name = f"value at a face along {'xyz'[axis]}"
     outside = [
         given.number(name, face.outside_value()) if _has_inflow(face) else None for face in pair
     ]
@@ -283,7 +282,7 @@ class _OperatorInput:
             and all(isinstance(v, Tensor) and v.dim() >= 3 for v in given)
         ):
             return [
-                self.grid(f"velocity along {AXES[axis]}", v, more=axis)  # type: ignore[arg-type]
+                self.grid(f"velocity along {'xyz'[axis]}", v, more=axis)  # type: ignore[arg-type]
                 for axis, v in enumerate(given)
             ]
         uniform = torch.as_tensor(given, dtype=torch.float64, device=self.device)
