@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -11,11 +11,13 @@ import numpy as np
 
 import torchfilm as tf
 from design.best import Best
+from design.entries import Entry
 from design.finals import fresh_goals
 from design.front_plot import draw_front
 from design.objective import Objective
 from design.parameters import Value, right_aligned, show_value
 from design.pareto import nondominated, spread
+from design.reasons import tally
 from design.report import at_bound, cells_in, constrained, cost_words, failure_words
 from design.study import Study
 from design.targets.goals import Constrained, Goals, in_words, of_seeds
@@ -197,6 +199,16 @@ def front_of(search: FrontSearch, study: Study, sizes: Sequence[float]) -> Front
         points, goals, seeds = fresh
         untested = len(known - {p.tobytes() for p in points})
     rows = nondominated(goals)
+    if not len(rows) and seeds:
+        checks.warn(
+            f"each of the {len(points)} designs that were grown on fresh seeds failed there:"
+            f" {_usual_failure(study.finals)}. The front is that on the seeds of the search."
+        )
+        return front_of(search, study, ())
     if not len(rows):
-        raise tf.InputError(f"every design failed: {study.failures()[0][0]}")
+        raise tf.InputError(f"every design failed: {_usual_failure(study.entries)}")
     return Front(search, target.titles, points[rows], goals[rows], seeds, untested)
+
+
+def _usual_failure(entries: Iterable[Entry]) -> str:
+    return tally(why for entry in entries for why in entry.reasons.values())[0][0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -102,7 +103,7 @@ class Posterior:
     def samples(self) -> dict[str, np.ndarray]:
         """Samples of each parameter by name, (S,) each; sample k of all of them belongs
         together."""
-        return {n: np.array(v) for n, v in shown_values(self.task, self.points).items()}
+        return {n: _column(v) for n, v in shown_values(self.task, self.points).items()}
 
     @property
     def mean(self) -> dict[str, Value]:
@@ -294,5 +295,11 @@ def _check_some(found: Simulations) -> None:
 
 
 def _most_frequent(values: np.ndarray) -> Value:
-    found, counts = np.unique(values, return_counts=True)
-    return found[counts.argmax()].item()
+    found: Value = Counter(values.tolist()).most_common(1)[0][0]
+    return found
+
+
+def _column(values: list[Value]) -> np.ndarray:
+    """(S,); options of several kinds, such as "auto" and 3, stay what they are."""
+    several = len({type(value) for value in values}) > 1
+    return np.array(values, dtype=object if several else None)

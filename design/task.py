@@ -33,6 +33,7 @@ from design.targets.several import observed_at
 from torchfilm import checks
 
 NONE = cast(Target, None)  # the target where `targets` are given
+COUNTS = {"cells": 2, "replicates": 1, "most": 1, "seed": 0}  # and the least of each
 REDUCE = ("mean", "worst")
 TOO_MANY, NEVER = 1e8, 1e30  # cells of a colony: of which is warned, and which none can have
 SHORTEST = 1000  # parts of the first time among which a step is looked for
@@ -103,9 +104,10 @@ class Task(TaskOptions):
         if self.until is None and self.cells is None:
             self._set(until=own)
         until = _check_options(self)
-        function = scene_function(self.scene)
         # numbers of NumPy would be written so in a study, which is read as plain text
         plain = lambda x: x.item() if isinstance(x, np.generic) else x
+        self._set(**{n: plain(getattr(self, n)) for n in (*COUNTS, "reduce")})
+        function = scene_function(self.scene)
         fixed = {name: plain(value) for name, value in (self.fixed or {}).items()}
         space, conditions = Space(self.parameters), self.target.arguments
         family = SceneFamily(function, space, fixed, self.device, conditions)
@@ -301,8 +303,10 @@ def describe_target(target: Target) -> str:
 
 
 def _without_addresses(value: Any) -> str:
-    """The text of a value, without its address in the memory of this process."""
-    return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+    """The text of a value, without its address in the memory of this process, and with numbers of
+    NumPy as those of Python."""
+    plain = re.sub(r"np\.(?:float64|u?int\d+)\(([^()]*)\)", r"\1", repr(value))
+    return re.sub(r" at 0x[0-9a-f]+", "", plain)
 
 
 def _one_target(target: Any, targets: Any) -> Target:
@@ -322,7 +326,7 @@ def _check_options(options: TaskOptions) -> float | None:
     """Check what needs no scene; returns `until` as a float."""
     if options.cells is None and options.until is None:
         raise checks.InputError("a colony needs an end: give cells=… or until=… (hours).")
-    for name, least in (("cells", 2), ("replicates", 1), ("most", 1), ("seed", 0)):
+    for name, least in COUNTS.items():
         value = getattr(options, name)
         if value is not None or name in ("replicates", "seed"):
             checks.integer(name, value, least=least)

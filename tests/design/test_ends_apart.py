@@ -204,6 +204,9 @@ def test_a_check_grows_data_to_no_other_size():
     assert found.sizes == () and len(found.losses) == 1
     with pytest.raises(tf.InputError, match=r"sizes = \(0\.5,\).*data were observed at 2 h"):
         best.check(seeds=1, sizes=(0.5,), progress=False)
+    with pytest.raises(tf.InputError, match=r"sizes = 2\.0 .*data were observed at 2 h"):
+        best.check(seeds=1, sizes=2.0, progress=False)
+    assert best.check(seeds=1, sizes=[], change=0.3, progress=False).sizes == ()
 
 
 def test_within_a_range_there_is_no_slope():

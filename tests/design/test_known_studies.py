@@ -7,7 +7,22 @@ import pytest
 from searching import Level, fragile, lit
 
 import torchfilm as tf
-from design import CMAES, Bayesian, Choice, Finals, Parameter, Racing, Search, Sobol, Spread, Study
+from design import (
+    CMAES,
+    Bayesian,
+    Burden,
+    Choice,
+    Finals,
+    Parameter,
+    Racing,
+    Search,
+    Sobol,
+    Spread,
+    Stripe,
+    Study,
+    Weighted,
+)
+from design.task import describe_target
 
 MAKE = [Parameter("make", 0.1, 10.0, log=True)]
 
@@ -269,3 +284,22 @@ def test_a_fixed_number_may_be_of_numpy(number):
     known = made.study.entries[0]
     assert known.copies == 0 and {v["decay"] for v in known.values} == {float(number)}
     assert np.array_equal(known.loss, np.concatenate([e.loss for e in old.study.entries]))
+
+
+@pytest.mark.parametrize("name", ["cells", "replicates", "seed"])
+def test_numbers_of_numpy_are_numbers_in_a_study(name, tmp_path):
+    """A sweep by np.arange gives such."""
+    path = tmp_path / "study.h5"
+    options = {"cells": 3, "replicates": 2, "seed": 1, "method": Sobol(batch=4), "finals": None}
+    given = {**options, name: np.int64(options[name])}
+    best = Search(lit, MAKE, Level(), **given).run(8, study=path, progress=False)
+    best.save(tmp_path / "best.json")
+    again = Search(lit, MAKE, Level(), **options).run(8, study=path, progress=False)
+    assert again.loss == best.loss and len(Study.read(path).entries) == 1
+
+
+def test_targets_of_numbers_of_numpy_are_the_same_targets():
+    number = lambda of: [Stripe("gfp", at=of(3.0), width=of(2.0)), Weighted([(Burden(), of(2))])]
+    for plain, numpy in zip(number(float), number(np.float64), strict=True):
+        assert describe_target(plain) == describe_target(numpy)
+        assert "np." not in describe_target(numpy) and "2.0" in describe_target(numpy)

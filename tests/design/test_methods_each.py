@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from asking import SPACES, Room, begun, ellipsoid, evaluate, follow, sphere
 
-from design.methods import CMAES, Bayesian, Racing, Sobol
+from design.methods import CMAES, Bayesian, Exhaustive, Racing, Sobol
 from design.methods.base import sobol_points
 from design.methods.bayesian import tamed
 from torchfilm.tools.checks import InputError
@@ -293,3 +293,20 @@ if find_spec("botorch"):
         first, *others = [batch.points for batch, _ in follow(given, ellipsoid, 5)]
         distinct = {row.tobytes() for row in np.concatenate([first, *others])}
         assert len(distinct) == 8 + len({row.tobytes() for row in first})
+
+
+def test_a_cloud_about_a_known_design_is_narrow():
+    method = CMAES(population=200, sigma=0.5)
+    method.start(Room((None, None)), 0, 1)
+    method.know(np.array([[0.4, 0.6], [0.9, 0.1]]), np.array([0.1, 0.2]))
+    points = method.ask().points
+    assert points.mean(0) == pytest.approx([0.4, 0.6], abs=0.05) and points.std(0).max() < 0.15
+
+
+def test_the_order_of_all_designs_follows_the_seed():
+    orders = []
+    for seed in (0, 1, 1):
+        method = Exhaustive()
+        method.start(Room((5, 6)), seed, 1)
+        orders.append(method.ask().points.tolist())
+    assert orders[0] != orders[1] == orders[2]

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from design import Choice
 from design.neural_posterior import NeuralPosterior
 from design.options import MOST, Options
+from design.parameters import Space
+from design.posterior import Posterior
 
 needs_sbi = pytest.mark.skipif(find_spec("sbi") is None, reason='needs pip install -e ".[infer]"')
 
@@ -94,3 +98,12 @@ def test_the_number_may_depend_on_the_option():
     assert np.median(drawn[first, 1]) == pytest.approx(0.25, abs=0.03)
     assert np.median(drawn[~first, 1]) == pytest.approx(0.75, abs=0.03)
     assert np.array_equal(drawn, learnt.sample(np.array([[0.25]]), 2000, seed=0)[0])
+
+
+def test_samples_of_a_choice_keep_the_kinds_of_its_options():
+    """A text and a number: the most frequent option is one that the scene takes."""
+    space = Space([Choice("mode", ("auto", 3))])
+    points = np.array([[0.75], [0.75], [0.25]])
+    posterior = Posterior(SimpleNamespace(space=space), None, None, None, None, points)
+    assert posterior.mean == {"mode": 3} and space.point(posterior.mean) == [0.75]
+    assert list(posterior.samples["mode"]) == [3, 3, "auto"]

@@ -9,12 +9,14 @@ import h5py
 import numpy as np
 import pytest
 import scipy.stats
+from searching import Level, lit, objective_of
 
 import torchfilm as tf
 from design import Choice, Measured, Parameter, infer
 from design.inference import LEAST
 from design.neural_posterior import WIDE, NeuralPosterior, _compressed
 from design.parameters import Space
+from design.posterior import _first
 from design.prior import Prior
 from design.region import BEYOND, MARGIN, Region
 from design.region import LEAST as LEAST_WIDTH
@@ -212,3 +214,13 @@ def test_only_statistics_that_vary_far_more_than_their_errors_have_a_unit(monkey
         points, np.c_[points, points], unit=unit, seed=0, flows=1, epochs=1
     )
     assert learnt.unit.tolist() == [unit[0], np.inf]
+
+
+@pytest.mark.parametrize("replicates", [1, 40, 4000])
+def test_checks_and_predictions_have_random_numbers_of_their_own(replicates):
+    task = objective_of(
+        lit, [Parameter("make", 0.1, 10.0, log=True)], Level(), cells=4, replicates=replicates
+    ).task
+    firsts = [_first(task, stream) for stream in (2, 3, 4)]
+    assert all(b - a >= 2**15 for a, b in zip([0, *firsts], firsts, strict=False))
+    assert (firsts[-1] + 2**15) * replicates <= 2**32

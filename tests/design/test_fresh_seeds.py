@@ -1,0 +1,86 @@
+"""The fresh seeds of finals: when they tell nothing, what they chose, and where all fail on one."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from searching import Level, lit, mean
+
+from design import NSGA2, Burden, Finals, Parameter, Search, Sobol, Study, Target
+from design.entries import Entry
+from design.finals import FIRST_STREAM, SOUND_STREAM, is_certain
+
+LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
+
+
+def batch(losses, first=0) -> Entry:
+    """A design for each row of losses (n, R), on the seeds from `first` on."""
+    losses = np.array(losses)
+    n, r = losses.shape
+    return Entry(
+        points=np.linspace(0.1, 0.9, 2 * n).reshape(n, 2), loss=losses.mean(1), losses=losses,
+        cells=np.ones((n, r), int), reasons={}, size=1.0, seconds=0.0, values=[{}] * n,
+        streams=tuple(range(first, first + r)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "searched, sounded, certain",
+    [
+        ([[0.3, 0.3]], [[0.1, 0.1], [0.2, 0.2]], True),
+        ([[0.3, 0.3]], [[0.1, 0.1], [0.2, 0.3]], False),
+        # two designs with one loss, as where both are within a range: that says nothing of seeds
+        ([[0.3, 0.3]], [[0.0, 0.0], [0.0, 0.0]], False),
+        # the best designs are alike on all seeds, and another one of the search is not
+        ([[0.3, 0.3], [0.4, 0.5]], [[0.1, 0.1], [0.2, 0.2]], False),
+        # a failure is no difference between seeds
+        ([[0.3, 0.3], [0.4, Target.failed]], [[0.1, 0.1], [0.2, 0.2]], True),
+    ],
+)
+def test_when_seeds_make_no_difference(searched, sounded, certain):
+    task = Search(lit, LIT, Level(), cells=3, replicates=2).objective.task
+    study = Study({}, task.space.names, (0, 1), entries=[batch(searched)])
+    study.finals.append(batch(sounded, SOUND_STREAM))
+    assert is_certain(task, study) == certain
+
+
+def test_the_seeds_of_an_only_finalist_have_chosen_nothing():
+    made = Search(
+        lit, LIT, Level(), method=Sobol(batch=8), cells=3, replicates=2, finals=Finals(most=1)
+    )
+    best = made.run(60, progress=False)
+    assert {e.streams[0] for e in made.study.finals} == {FIRST_STREAM}
+    assert not best.fresh.chosen and "which chose it" not in best.table()
+
+
+@dataclasses.dataclass(frozen=True)
+class Chancy(Target):
+    """The distance of the mean level from 1, undefined on one of the fresh seeds."""
+
+    names = ("gfp",)
+
+    def loss(self, state, history=None):
+        return (mean(state, "gfp") - 1.0).abs().masked_fill(
+            state.stream == FIRST_STREAM + 2, torch.nan
+        )  # fmt: skip
+
+
+def test_where_all_finalists_fail_on_a_fresh_seed_the_front_is_that_of_the_search():
+    options = {"method": NSGA2(population=8), "cells": 3, "replicates": 2}
+    search = Search(lit, LIT, targets=[Chancy(), Burden()], **options)
+    with pytest.warns(UserWarning, match="fresh seeds failed there: the target's loss was nan"):
+        front = search.run(400, progress=False)
+    assert len(front) and front.seeds == 0
+    assert len(front) == len(search.front(fresh=False))
+
+
+def test_a_design_with_few_replicates_is_not_the_best():
+    """As the first of a race at full size, and those of slopes at first."""
+    whole, few = batch([[0.3, 0.5], [0.2, 0.4]]), batch([[0.1], [0.0]])
+    study = Study({}, ("make", "decay"), (0, 1), entries=[few, whole])
+    point, loss, losses = study.best()
+    assert study.full() == [whole] and loss == pytest.approx(0.3)
+    assert np.array_equal(point, whole.points[1]) and losses.tolist() == [0.2, 0.4]
