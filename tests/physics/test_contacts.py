@@ -17,11 +17,17 @@ from torchfilm.physics.contacts import (
     Capsules,
     closest_points,
     contact_gaps,
-    contact_points,
+    line_points,
 )
 from torchfilm.physics.near_rows import near_rows
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
+
+
+def contact_points(cells: Capsules, first: torch.Tensor, second: torch.Tensor):
+    """As `line_points` gives them."""
+    a, b = cells.take(first), cells.take(second)
+    return line_points(a, b, *closest_points(a, b))
 
 
 def halves(cells: Capsules) -> tuple[torch.Tensor, torch.Tensor]:
@@ -129,7 +135,7 @@ def test_rows_are_the_derivative_of_the_gap(dim):
     )
     first, second = halves(cells)
     gap = contact_gaps(cells, first, second)
-    line = contact_points(cells.take(first), cells.take(second))[-1]
+    line = contact_points(cells, first, second)[-1]
     keep = (gap < -0.01) & (gap > -0.95) & ~line
     first, second = first[keep], second[keep]
     found = rows_of(cells, first, second)
@@ -163,7 +169,7 @@ def test_rows_of_a_line_of_contact(dim, tilt):
     """
     cells, h = side_by_side(np.random.default_rng(2), 300, dim, tilt), 1e-6
     first, second = halves(cells)
-    s, t, end_a, end_b, line = contact_points(cells.take(first), cells.take(second))
+    s, t, end_a, end_b, line = contact_points(cells, first, second)
     points = [(s[k], t[k], end_a[k], end_b[k]) for k in range(2)]
     both = (
         line
@@ -206,7 +212,7 @@ def any_pairs(dim: int, dtype: torch.dtype) -> Capsules:
 def gaps_of_both(cells: Capsules) -> tuple[torch.Tensor, torch.Tensor]:
     """The gaps at the two points of `contact_points`, (2, P), and which contacts are lines."""
     first, second = halves(cells)
-    s, t, end_a, end_b, line = contact_points(cells.take(first), cells.take(second))
+    s, t, end_a, end_b, line = contact_points(cells, first, second)
     gaps = [
         gap_at(cells, first, second, s[k], t[k], end_a[k], end_b[k], cells.half) for k in range(2)
     ]

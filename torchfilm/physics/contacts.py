@@ -19,7 +19,7 @@ from torchfilm.tools.reads import rows_where
 from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_sqrt
 
 # Sine of the angle between two axes at which a line of contact has shrunk to a point (see
-# `contact_points`).
+# `line_points`).
 LINE_CONTACT_SINE = 0.4
 
 
@@ -126,21 +126,6 @@ def _distance2(between: Tensor, axis_a: Tensor, axis_b: Tensor, s: Tensor, t: Te
     return dot(d, d)
 
 
-def contact_points(a: Capsules, b: Capsules) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """One or two contact points of each pair.
-
-    Returns s (2, P), t (2, P), end of a (2, P), end of b (2, P), and whether the contact is a line
-    (P,).
-
-    Two parallel capsules touch along a line, two at an angle touch at a point. In between, the ends
-    of the line slide towards the closest point as the sine of the angle grows to
-    `LINE_CONTACT_SINE`, where they meet and the line ends. Each end of the line carries half the
-    weight (D = 1/√2), so neither force nor torque jumps. An `end` is −1, 0 or +1, or in between
-    while it slides: the part of ½ l with which the point moves when the cell grows.
-    """
-    return line_points(a, b, *closest_points(a, b))
-
-
 def slide_of(sine2: Tensor) -> Tensor:
     """How far the ends of a line of contact are from meeting, (P,). sine2: of the axes' angle.
 
@@ -152,7 +137,17 @@ def slide_of(sine2: Tensor) -> Tensor:
 def line_points(
     a: Capsules, b: Capsules, s0: Tensor, t0: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The result of `contact_points`, from the closest points (s0, t0)."""
+    """One or two contact points of each pair, from its `closest_points` (s0, t0).
+
+    Returns s (2, P), t (2, P), end of a (2, P), end of b (2, P), and whether the contact is a line
+    (P,).
+
+    Two parallel capsules touch along a line, two at an angle touch at a point. In between, the ends
+    of the line slide towards the closest point as the sine of the angle grows to
+    `LINE_CONTACT_SINE`, where they meet and the line ends. Each end of the line carries half the
+    weight (D = 1/√2), so neither force nor torque jumps. An `end` is −1, 0 or +1, or in between
+    while it slides: the part of ½ l with which the point moves when the cell grows.
+    """
     turn, cosine, between = cross(a.axis, b.axis), dot(a.axis, b.axis), b.centre - a.centre
     sine2 = dot(turn, turn)
     slide = slide_of(sine2)

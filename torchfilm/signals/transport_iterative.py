@@ -19,7 +19,6 @@ from torch import Tensor
 
 from torchfilm.signals.compiled_systems import Systems, may_solve
 from torchfilm.signals.transport_operator import Operator, apply
-from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.segments import keep, kept
 from torchfilm.tools.tangents import both, in_forward_mode, refuse_both, refuse_second, with_tangent
@@ -303,36 +302,3 @@ def _bicgstab(
         # a breakdown of the method: this colony restarts from its true residual
         going = going & (alpha != 0) & (omega != 0) & (new != 0)
     return x
-
-
-def convolve(operator: Operator, u: Tensor) -> Tensor:
-    """du/dt as `apply` gives it, by conv3d with a stencil of 3 × 3 × 3: the paper's equation 7.
-
-    It requires uniform rates. It is a second way to the same numbers, to check `apply`. On the CPU
-    it is many times slower than differences of fluxes, and its last bits depend on the rest of the
-    batch.
-    """
-    if operator.interior is None:
-        raise checks.input_error(
-            "velocity", "a velocity that is not uniform", "uniform for a convolution", "Use apply."
-        )
-    kernel = torch.zeros(operator.colonies, 1, 3, 3, 3, dtype=torch.float64, device=u.device)
-    inside = u if operator.mask is None else u * operator.mask
-    padded = inside
-    for axis, (up, down) in enumerate(operator.interior):
-        for side, rate in ((0, up), (2, down)):
-            place = [1, 1, 1]
-            place[axis] = side
-            weight = torch.zeros(3, 3, 3, dtype=torch.float64, device=u.device)
-            weight[tuple(place)] = 1.0
-            kernel = kernel + rate.reshape(-1, 1, 1, 1, 1) * weight
-        dim, own_neighbour = axis + 1, operator.axes[axis].own_neighbour
-        edge = padded.narrow(dim, -1, 1), padded.narrow(dim, 0, 1)
-        if not operator.axes[axis].periodic or own_neighbour:
-            edge = torch.zeros_like(edge[0]), torch.zeros_like(edge[1])
-        padded = torch.cat([edge[0], padded, edge[1]], dim)
-    out = torch.conv3d(padded.unsqueeze(0), kernel.to(u.dtype), groups=operator.colonies).squeeze(0)
-    if operator.mask is not None:
-        out = out * operator.mask
-    out = out - operator.loss.to(u.dtype) * u
-    return out if operator.gain is None else out + operator.gain.to(u.dtype)
