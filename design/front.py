@@ -15,7 +15,7 @@ from design.entries import Entry
 from design.finals import fresh_goals
 from design.front_plot import draw_front
 from design.objective import Objective
-from design.parameters import Value, right_aligned, show_value
+from design.parameters import Value, show_value
 from design.pareto import nondominated, spread
 from design.reasons import tally
 from design.report import at_bound, cells_in, constrained, cost_words, failure_words
@@ -99,7 +99,7 @@ class Front:
     def table(self) -> str:
         """The goals and the parameters of each design; which lie at a bound; what colonies without
         a pattern would have; and what the search took. It grows the designs at both ends again."""
-        lines = [*right_aligned(self._rows()), self._where(), *self._remarks()]
+        lines = [*displays.aligned(self._rows()), self._where(), *self._remarks()]
         return displays.Text("\n".join(lines))
 
     def _remarks(self) -> list[str]:

@@ -296,12 +296,6 @@ def _check_name(kind: str, name: Any) -> None:
         raise checks.input_error(f"{kind}.name", name, "the name of an argument of the scene")
 
 
-def right_aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """The lines of a table, its columns aligned at their right."""
-    wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(x.rjust(w) for x, w in zip(r, wide, strict=True)) for r in rows]
-
-
 def show_value(value: Value) -> str:
     """A value in a table."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)

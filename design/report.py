@@ -20,6 +20,7 @@ from design.targets.lasting import Lasting
 from design.targets.measured import extinct_words, has_mean_with_error
 from design.task import Task
 from design.trivial import EVERY_SECOND, trivial_losses
+from torchfilm import displays
 
 WORST = 3  # statistics that a poor fit names
 LARGE = 1e5  # a loss of which decimals say nothing
@@ -85,14 +86,7 @@ def table(report: SearchReport) -> str:
         means = (show_value(_mean(values)) for values in (old.get(name, []), new[name]))
         row = (name, target.bounds.get(name, ""), *means, _spread(new[name]))
         rows.append((*row, seen.get(name, "")) if seen else row)
-    wide = [max(len(r[k]) for r in rows) for k in range(len(rows[0]))]
-    lines = [
-        "  ".join(
-            x.rjust(w) if k in (2, 3) else x.ljust(w)
-            for k, (x, w) in enumerate(zip(r, wide, strict=True))
-        ).rstrip()
-        for r in rows
-    ]
+    lines = displays.aligned(rows, left=(0, 1, 4, 5))
     lines += _undefined(target, new)
     lines += _warnings(report)
     lines += failure_words(study, target)

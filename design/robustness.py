@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from design.parameters import Value, show_value
 from design.robustness_plots import draw_changes, draw_indices, draw_losses
 from design.sensitivity import Indices
 from design.variation import Varied
-from torchfilm import checks
+from torchfilm import checks, displays
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,18 +120,18 @@ class Robustness:
         if self.varied is not None:
             name = f"all parameters ± {self.varied.vary:.0%}"
             rows.append((name, "", "", *_summary(self.varied.losses)))
-        lines += _aligned(rows)
+        lines += displays.aligned(rows, left=(0,))
         if self.varied is not None and self.varied.clipped > 0:
             lines.append(
                 f"of varied parameters {self.varied.clipped:.0%} were held by their bounds"
             )
-        lines += ["", *_aligned(self._change_rows())]
+        lines += ["", *displays.aligned(self._change_rows(), left=(0,))]
         if self.indices is not None:
             lines += [
                 "",
                 f"share of the loss's variance over the whole space, {self.indices.samples}"
                 f" samples, {self.indices.colonies} colonies",
-                *_aligned(self._index_rows(self.indices)),
+                *displays.aligned(self._index_rows(self.indices), left=(0,)),
             ]
         return tf.displays.Text("\n".join(lines))
 
@@ -201,16 +200,6 @@ def _summary(losses: np.ndarray) -> tuple[str, ...]:
 
 def _or_blank(number: float | None) -> str:
     return "" if number is None else f"{number:g}"
-
-
-def _aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            x.rjust(w) if k else x.ljust(w) for k, (x, w) in enumerate(zip(row, wide, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
 
 
 def _plain(given: Any) -> Any:

@@ -14,7 +14,7 @@ import torchfilm as tf
 from design.data_file import Stamp, stamp
 from design.entries import Entry
 from design.history import history_of, write_csv
-from design.parameters import right_aligned, show_value
+from design.parameters import show_value
 from design.reasons import tally
 from design.study_file import StudyData, read_study, write_study
 from design.study_refusal import refusal
@@ -107,7 +107,7 @@ class Study:
         """The best designs that were grown to full size, the first of equal ones first: loss, its
         spread between replicates, cells, and the values of the parameters. most: rows."""
         text, more = self._rows(most)
-        return displays.Text("\n".join(right_aligned(text) + ([more] if more else [])))
+        return displays.Text("\n".join(displays.aligned(text) + ([more] if more else [])))
 
     def history(self, path: str | Path | None = None) -> dict[str, list[Any]]:
         """Every design that was grown, in order, as columns by name, for pandas or a plot: a row

@@ -1,10 +1,11 @@
-"""Displays in notebooks: titles, tables and texts as HTML that reads well on light and on dark
-pages, and output that is redrawn in place. IPython is used where a notebook has loaded it."""
+"""Tables of texts, and displays in notebooks: titles, tables and texts as HTML that reads well on
+light and on dark pages, and output that is redrawn in place. IPython is used where a notebook has
+loaded it."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -22,6 +23,14 @@ def card(title: str, *parts: str) -> str:
         f'<div style="margin:.2em 0"><div style="font-weight:600">{escape(title)}</div>'
         f"{''.join(parts)}</div>"
     )
+
+
+def aligned(rows: Sequence[Sequence[str]], left: Container[int] = ()) -> list[str]:
+    """The lines of a table of texts, for a terminal. left: which columns begin below each other;
+    the others end so."""
+    wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    put = [str.ljust if k in left else str.rjust for k in range(len(wide))]
+    return ["  ".join(f(x, w) for f, x, w in zip(put, r, wide, strict=True)).rstrip() for r in rows]
 
 
 def table(rows: Iterable[Sequence[object]], head: Sequence[object] = ()) -> str:

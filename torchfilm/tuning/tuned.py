@@ -166,7 +166,4 @@ def _front_lines(tuned: Tuned) -> list[str]:
 
 
 def _aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    wide = [max(len(r[k]) for r in rows) for k in range(len(rows[0]))]
-    return [
-        "  " + "  ".join(x.ljust(w) for x, w in zip(r, wide, strict=True)).rstrip() for r in rows
-    ]
+    return [f"  {line}" for line in displays.aligned(rows, left=range(len(rows[0])))]
