@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from founded import cells_in, crowd
 from helpers import step
 
 import torchfilm as tf
+from torchfilm.tools.checks import InputError
 
 
 def two_designs(make, colonies: int = 2) -> list[tf.State]:
@@ -138,3 +140,38 @@ def test_what_is_stated_per_colony_stands_where_a_list_may(make):
     scene = tf.Scene(tf.Growth(rate=1.0), make(), dim=2)
     ((_, values),) = scene.per_colony()
     assert values.tolist() == [5.0, 6.0] and scene.bind(2).start().colonies == 2
+
+
+class Column:
+    """A column of a data frame whose rows have other numbers: it has `values`, and no place 0."""
+
+    def __init__(self, values):
+        self.values = np.array(values)
+
+    def __array__(self, dtype=None, copy=None):
+        return self.values if dtype is None else self.values.astype(dtype)
+
+    def __len__(self):
+        return len(self.values)
+
+    def __getitem__(self, name):
+        raise KeyError(name)
+
+
+@pytest.mark.parametrize("kind", [np.int8, np.uint16, np.int64, np.float32, np.float64])
+def test_columns_of_data_frames_are_one_number_per_colony(kind):
+    rates = Column(np.array([1, 2, 3], dtype=kind))
+    bind = lambda rate: tf.Scene(tf.Growth(rate=rate), tf.Division(length=4.0), dim=2).bind(3)
+    for given in (rates, tf.PerColony(rates), {0: rates}):
+        assert bind(given).start().growth_rate.tolist() == [1.0, 2.0, 3.0]
+    wall = tf.Plane(y=-1.0, facing="+y", stiffness=rates)
+    assert wall.stiffness.tolist() == [1.0, 2.0, 3.0]
+    scene = bind(rates)
+    rates.values[:] = 9
+    assert scene.start().growth_rate.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_columns_of_texts_are_no_numbers():
+    for given in (Column(["a", "b"]), Column(np.array([1, None], dtype=object)), np.array(["a"])):
+        with pytest.raises(InputError, match=r"Growth\.rate = .*must be a number, or numbers"):
+            tf.Growth(rate=given)

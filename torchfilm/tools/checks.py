@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.tools.one_per_colony import Value as Value
+from torchfilm.tools.one_per_colony import as_tensor
 from torchfilm.tools.warn_once import SMALL_SPECIES as SMALL_SPECIES  # public, for searches
 from torchfilm.tools.warn_once import once as once
 from torchfilm.tools.warn_once import warn as warn
@@ -255,19 +256,10 @@ def value(
     keeps its gradient.
     """
     given = getattr(given, "one_per_colony", given)  # of a PerColony
-    if isinstance(given, (list, tuple)):
-        devices = [x.device for x in given if isinstance(x, Tensor)]
-        try:
-            given = (
-                # on a GPU where one of them is
-                _stacked(given, next((d for d in devices if d.type != "cpu"), devices[0]))
-                if devices
-                else torch.tensor(given, dtype=torch.float64)
-            )
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise input_error(name, given, "a number, or numbers", hint) from error
-    if hasattr(given, "__array__") and not isinstance(given, Tensor):
-        given = torch.as_tensor(given).clone()  # the caller may change its own
+    try:
+        given = as_tensor(given)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise input_error(name, given, "a number, or numbers", hint) from error
     if not isinstance(given, Tensor):
         return number(name, given, above=above, least=least, most=most, hint=hint)
     if torch._C._functorch.is_functorch_wrapped_tensor(given):
@@ -301,14 +293,10 @@ def part_value(
 ) -> Any:
     """A value of a part of an effect, such as a wall: as `value`. One that is stated for each
     colony or cell type, or drawn, stays as it is: the effect checks it."""
-    stated = hasattr(given, "values") and not isinstance(given, Tensor)
+    stated = hasattr(given, "values") and not hasattr(given, "__array__")  # as tensors have
     if stated or hasattr(given, "draw"):
         return given
     return value(name, given, above=above, least=least, most=most)
-
-
-def _stacked(given: Sequence[Any], device: torch.device) -> Tensor:
-    return torch.stack([torch.as_tensor(x).to(device, torch.float64) for x in given])
 
 
 def below(low: float | Tensor, high: float | Tensor) -> bool:

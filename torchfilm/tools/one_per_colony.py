@@ -1,10 +1,12 @@
-"""The types of a value that users give as one number, or as one per colony."""
+"""What users may give as one number, or as one per colony: its types, and their tensors."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -18,3 +20,19 @@ class OnePerColony(Protocol):
 
 Value = float | Tensor | Sequence[float] | NDArray[Any] | OnePerColony
 Kept = float | Tensor  # what a description keeps of it, once checked
+
+
+def as_tensor(given: Any) -> Any:
+    """A list, an array or a column of a data frame as a tensor of its own; anything else stays.
+    Raises TypeError, ValueError or RuntimeError for what holds no numbers."""
+    if isinstance(given, (list, tuple)):
+        devices = [x.device for x in given if isinstance(x, Tensor)]
+        if not devices:
+            return torch.tensor(given, dtype=torch.float64)
+        # on a GPU where one of them is
+        device = next((d for d in devices if d.type != "cpu"), devices[0])
+        return torch.stack([torch.as_tensor(x).to(device, torch.float64) for x in given])
+    if hasattr(given, "__array__") and not isinstance(given, Tensor):
+        copied = np.array(given)  # the caller may change its own
+        return torch.from_numpy(copied.astype(np.float64) if copied.dtype.kind in "iu" else copied)
+    return given
