@@ -197,3 +197,35 @@ def test_colonies_that_stand_still_are_named_after_others_have_left():
                 states.send(state.select([0, 2]))
             if state.step == 1100:
                 break
+
+
+FREE = tf.Growth(rate=1.5), tf.Division(length=4.0)
+HOURS = r"until = 60 h: at 1\.5/h, a cell becomes 10\^39 cells by then\. Are times in hours"
+
+
+@pytest.mark.parametrize("more", [(), (tf.Mechanics(dim=2),)], ids=["alone", "contacts"])
+def test_a_time_in_minutes_is_warned_of(more):
+    with pytest.warns(UserWarning, match=HOURS):
+        next(tf.simulate(tf.Scene(*FREE, *more, dim=2, dt=0.05), until=60.0))
+
+
+@pytest.mark.parametrize(
+    ("more", "end"),
+    [
+        ((), {"until": 60.0, "cells": 50}),
+        ((), {"until": 13.0}),
+        ((tf.Lysis(rate=1.0),), {"until": 60.0}),
+        ((tf.Rules(lambda cells: None),), {"until": 60.0}),
+        ((tf.Mechanics(dim=2, length_drag=10.0),), {"until": 60.0}),
+        ((tf.Mechanics(dim=2, walls=[tf.Plane(y=-9.0, facing="+y")]),), {"until": 60.0}),
+    ],
+    ids=["cells", "hours", "lysis", "rules", "pressure", "walls"],
+)
+def test_long_runs_of_what_may_stay_small_are_not_warned_of(more, end):
+    next(tf.simulate(tf.Scene(*FREE, *more, dim=2, dt=0.05), **end))
+
+
+def test_a_state_near_its_end_is_not_warned_of():
+    scene = tf.Scene(*FREE, dim=2, dt=0.05)
+    late = scene.bind().start().replace(time=50.0, step=1000)
+    next(tf.simulate(scene, late, until=60.0))

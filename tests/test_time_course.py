@@ -119,3 +119,17 @@ def test_bands_are_of_the_middle_cells_and_few_counts_are_even(tmp_path):
     assert len(lengths.collections) == 4 and counts.get_yscale() == "linear"
     band = lengths.collections[0].get_paths()[0].vertices[:, 1]
     assert (band.min(), band.max()) == pytest.approx((1.0, 9.0))
+
+
+def test_replicates_are_told_apart_by_their_colonies(tmp_path):
+    path = tmp_path / "run.h5"
+    circuit = tf.Circuit(makes, species="gfp", make=torch.tensor([1.0, 1.0, 2.0]))
+    tf.simulate(tf.Scene(circuit, dim=2, dt=0.1), until=0.5, record=path).last()
+    shown = lambda **which: [
+        text.get_text().replace("\u2009", " ")
+        for text in tf.pictures.time_course(path, "gfp", **which).figure.axes[0].get_legend().texts
+    ]
+    names = shown()
+    assert [n.rpartition(", ")[2] for n in names] == ["colony 0", "colony 1", "colony 2"]
+    assert len({*names}) == 3 and all(n.startswith("make = ") for n in names)
+    assert "colony" not in "".join(shown(colonies=[0, 2]))

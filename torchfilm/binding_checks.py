@@ -4,6 +4,7 @@ whether growth can be recorded."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,10 @@ from torchfilm.tools import checks, row_checks
 from torchfilm.tools.hashing import trained
 from torchfilm.tools.tangents import tracked
 from torchfilm.tools.warn_once import warn
+from torchfilm.values import smallest
+
+TOO_MANY = 1e9  # cells of a colony
+HARDLY_SLOWED = 1e4  # μ·µm, the length drag above which pressure hardly slows growth
 
 if TYPE_CHECKING:
     from torchfilm.model import Model
@@ -82,6 +87,40 @@ def warn_of_no_growth(effects: Sequence[BoundEffect]) -> None:
     """Warn where cells divide at a threshold and nothing makes them longer."""
     if why := _why_none_divides(effects):
         warn(f"No cell will divide but those that are long enough now: {why}.")
+
+
+def warn_of_too_many(effects: Sequence[BoundEffect], state: State, until: float) -> None:
+    """Warn of a time, h, by which a colony that nothing holds back has more cells than any run
+    comes to."""
+    rate = state.fields.get("growth_rate")
+    if rate is None or not state.cells or state.declared["growth_rate"].unit != "1/h":
+        return
+    if not any(e.effect.divides_at_threshold for e in effects) or any(map(_may_hold, effects)):
+        return
+    fastest = float(rate.detach().max())
+    if fastest * (until - state.time) > math.log(TOO_MANY):
+        power = fastest * (until - state.time) / math.log(10.0)
+        warn(
+            f"until = {until:g} h: at {fastest:.3g}/h, a cell becomes 10^{power:.0f} cells by then."
+            " Are times in hours, and rates in 1/h? Else end the run at a number of cells, too"
+            " (cells=…)."
+        )
+
+
+def _may_hold(bound: BoundEffect) -> bool:
+    """Whether an effect may keep a colony from growing at its rate: it removes cells, sets rates,
+    has walls, or lets pressure slow growth."""
+    effect, writes = bound.effect, bound.writes()
+    slow = getattr(effect, "length_drag", None)
+    return (
+        is_own(effect)
+        or effect.writes_anything
+        or "growth_rate" in writes
+        or ("cells" in writes and not effect.divides_at_threshold)
+        or not getattr(effect, "is_plain", True)
+        or bool(getattr(effect, "walls", ()))
+        or (slow is not None and smallest(slow) < HARDLY_SLOWED)
+    )
 
 
 def _why_none_divides(effects: Sequence[BoundEffect]) -> str:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchfilm.initial_cells import Cells
 from torchfilm.tools import checks
+from torchfilm.tools.one_per_colony import by_position
 from torchfilm.tools.tangents import tracked
 from torchfilm.values import PerColony
 
@@ -162,7 +163,7 @@ def checked_streams(given: Sequence[int] | Tensor | None, colonies: int) -> Tens
     """Which stream each colony follows, (B,) int64; None for its own. Raises InputError."""
     if given is None:
         return None
-    found = torch.as_tensor(given)
+    found = torch.as_tensor(by_position(given))
     integers = not (found.is_floating_point() or found.dtype == torch.bool)
     if found.shape != (colonies,) or not integers or bool(((found < 0) | (found >= 2**32)).any()):
         raise checks.input_error(

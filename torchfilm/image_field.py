@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchfilm.tools import checks
 from torchfilm.tools.hashing import digest
+from torchfilm.tools.one_per_colony import by_position
 
 
 class ImageField(metaclass=checks.KnownKeywords):
@@ -87,7 +88,7 @@ class ImageField(metaclass=checks.KnownKeywords):
                 rule = f"the number of one of {count} images for each place"
                 raise checks.input_error("which", which, rule, "Such as mask(position, p.mask).")
             return 0
-        given = torch.as_tensor(which, device=position.device).detach()
+        given = torch.as_tensor(by_position(which), device=position.device).detach()
         whole = given.expand(len(position)).long()
         if not bool((whole == given).all()) or not bool(((whole >= 0) & (whole < count)).all()):
             raise checks.input_error("which", which, f"whole numbers from 0 to {count - 1}")

@@ -254,11 +254,14 @@ class Model:
         if divides:
             binding_checks.warn_of_lost_genes(self.effects)
 
-    def check_end(self, state: State, cells: int | None) -> None:
+    def check_end(self, state: State, cells: int | None, until: float | None = None) -> None:
         """Raise InputError, or warn, if no run from this state would come to `cells` cells; warn if
-        a run to a time (None) has no growth that its division waits for."""
+        a run to a time (None) has no growth that its division waits for, or would by `until`, h,
+        have more cells than any run comes to."""
         if cells is None:
             binding_checks.warn_of_no_growth(self.effects)
+            if until is not None:
+                binding_checks.warn_of_too_many(self.effects, state, until)
         else:
             binding_checks.check_end(self.effects, state, cells)
 

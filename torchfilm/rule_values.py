@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchfilm.state import CELL, State
 from torchfilm.tools import checks
+from torchfilm.tools.one_per_colony import by_position
 from torchfilm.tools.warn_once import warn
 
 
@@ -72,6 +73,7 @@ def real_column(what: str, value: Any, state: State) -> Tensor:
 def as_tensor(name: str, value: Any, device: torch.device) -> Tensor:
     """The value as a tensor, or RuleError."""
     try:
+        value = by_position(value)
         return value if isinstance(value, Tensor) else torch.as_tensor(value, device=device)
     except (TypeError, ValueError, RuntimeError) as error:
         raise RuleError(

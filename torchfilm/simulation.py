@@ -89,7 +89,7 @@ def simulate(
     last = math.inf if until is None else _last_step(state, checks.number("until", until), dt)
     model.check(state)
     model.check_step(dt)
-    model.check_end(state, cells if until is None else None)
+    model.check_end(state, cells if until is None else None, until if cells is None else None)
     recorder = _attached(record, model, dt, _ended(last, cells, state))
     monitors = _monitors(recorder, observers, cells if until is None else None, on_failure, timings)
     bar = _run_bar(model, state, cells, until) if wanted(progress) else None

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -205,7 +206,7 @@ class Bands(ProfileTarget):
     def __post_init__(self) -> None:
         object.__setattr__(self, "species", species_names("Bands.species", self.species))
         checks.choice("Bands.along", self.along, ALONG)
-        edges = self.edges
+        edges = self.edges.tolist() if isinstance(self.edges, np.ndarray) else self.edges
         rule = f"{len(self.species) + 1} ascending places in µm, one more than species"
         if (
             isinstance(edges, str)

@@ -448,3 +448,10 @@ def test_a_gradient_that_falls_as_an_exponential():
 def test_a_gradient_has_one_form(given, words):
     with pytest.raises(tf.InputError, match=words):
         Gradient("yfp", "x", 1.0, **given)
+
+
+def test_edges_may_be_an_array():
+    bands = Bands(("yfp", "cfp"), np.array([-6, 0, 5]))
+    assert bands == Bands(("yfp", "cfp"), (-6.0, 0.0, 5.0)) and bands.edges == (-6.0, 0.0, 5.0)
+    with pytest.raises(tf.InputError, match=r"Bands\.edges = \[0\.0, -1\.0\]"):
+        Bands(("yfp",), np.array([0.0, -1.0]))

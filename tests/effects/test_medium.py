@@ -322,3 +322,10 @@ def test_what_nothing_reads_is_warned_of(given, words):
 def test_a_diffusion_in_other_units_is_warned_of():
     with pytest.warns(UserWarning, match=r"'ahl' diffuses at 2e-09 µm²/h.*m²/s"):
         tf.Medium(ahl=tf.Signal(2e-9), box=BOX, spacing=4.0)
+
+
+def test_texts_are_no_box():
+    with pytest.raises(tf.InputError, match=r"Medium\.box = .*two corners"):
+        tf.Medium(ahl=tf.Signal(1.0), box=(("-8", "-8"), ("8", "8")), spacing=4.0)
+    with pytest.raises(tf.InputError, match=r"Medium\.spacing = .*numbers"):
+        tf.Medium(ahl=tf.Signal(1.0), box=BOX, spacing=("4", "4"))

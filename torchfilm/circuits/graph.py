@@ -28,6 +28,7 @@ from torchfilm.circuits.reactions import OUTSIDE
 from torchfilm.circuits.tracing import FULL, LAWS, Column, common_type, users_code
 from torchfilm.tools import checks
 from torchfilm.tools.deterministic_math import deterministic_functions
+from torchfilm.tools.one_per_colony import by_position
 
 F64 = torch.float64
 PLACES = 64  # at which sums are looked for
@@ -219,7 +220,7 @@ class CircuitGraph:
             if name not in known and not name.startswith((OUTSIDE, "cell.", "p.")):
                 raise checks.InputError(unknown(f"values have {name!r}", name, list(names)))
             try:
-                given[name] = torch.as_tensor(value, dtype=torch.float64)
+                given[name] = torch.as_tensor(by_position(value), dtype=torch.float64)
             except (TypeError, ValueError, RuntimeError) as error:
                 raise checks.input_error(f"values[{name!r}]", value, "numbers") from error
         for name in names:

@@ -102,7 +102,11 @@ def _lines(
     places: Sequence[int], kinds: Sequence[int], by: str | None, frames: RecordedFrames
 ) -> list[CourseLine]:
     """One for each colony, or for each kind of each."""
-    name = frames[0].name
+    named = {p: frames[0].name(p) for p in places}
+    if len({*named.values()}) < len(named):  # replicates have the same parameters
+        ids = frames.results.colony_id
+        named = {p: f"{name}, colony {ids[p]}" for p, name in named.items()}
+    name = named.__getitem__
     if by is None:
         colours = _colours(len(places))
         return [CourseLine(p, ALL, name(p), c, "-") for p, c in zip(places, colours, strict=True)]

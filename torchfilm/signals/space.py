@@ -27,6 +27,8 @@ def checked_box(
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     """Returns the lower corner, the upper corner and the size of voxels, checked."""
     try:
+        if any(isinstance(x, str) for corner in box for x in corner):
+            raise TypeError("texts")
         low, high = (tuple(float(x) for x in corner) for corner in box)
     except (TypeError, ValueError) as error:
         raise checks.input_error(

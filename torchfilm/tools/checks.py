@@ -369,6 +369,8 @@ def choice(name: str, given: object, allowed: Sequence[object]) -> None:
 def vector(name: str, given: object, size: int | None = None) -> tuple[float, ...]:
     """Returns a short tuple of finite numbers, or raises InputError."""
     try:
+        if any(isinstance(x, str) for x in given):  # type: ignore[attr-defined]
+            raise TypeError("texts")
         out = tuple(float(x) for x in given)  # type: ignore[attr-defined]
     except (TypeError, ValueError) as error:
         raise input_error(name, given, "a sequence of numbers") from error

@@ -22,6 +22,13 @@ Value = float | Tensor | Sequence[float] | NDArray[Any] | OnePerColony
 Kept = float | Tensor  # what a description keeps of it, once checked
 
 
+def by_position(given: Any) -> Any:
+    """A column of a data frame as an array: torch would read it by the labels of its rows. Anything
+    else stays."""
+    column = hasattr(given, "__array__") and not isinstance(given, (Tensor, np.ndarray))
+    return np.array(given) if column else given  # a copy, since columns may be read-only
+
+
 def as_tensor(given: Any) -> Any:
     """A list, an array or a column of a data frame as a tensor of its own; anything else stays.
     Raises TypeError, ValueError or RuntimeError for what holds no numbers."""

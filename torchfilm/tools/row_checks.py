@@ -3,6 +3,7 @@ colonies."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
@@ -11,12 +12,14 @@ import torch
 from torch import Tensor
 
 from torchfilm.tools import checks
+from torchfilm.tools.one_per_colony import by_position
 from torchfilm.tools.ragged import order_within
 from torchfilm.tools.warn_once import warn
 
 # What a user may give where whole numbers, or numbers, are wanted in a row.
 Rows = Tensor | np.ndarray | Sequence[int]
 Numbers = Tensor | np.ndarray | Sequence[float]
+SLOW = 0.05  # 1/h, a growth rate
 WHOLE = (torch.int64, torch.int32)  # of which torch takes rows
 
 
@@ -59,7 +62,7 @@ def checked_places(
 ) -> Tensor:  # fmt: skip
     """Places from 0 to count − 1, at least so many, (M,) int64. distinct: none comes twice."""
     try:
-        places = torch.as_tensor(given, device=device).reshape(-1)
+        places = torch.as_tensor(by_position(given), device=device).reshape(-1)
     except (TypeError, ValueError, RuntimeError) as error:
         raise checks.input_error(name, given, "whole numbers, such as [0, 2]") from error
     mask = places.dtype == torch.bool
@@ -334,3 +337,12 @@ def without_gradient(name: str, given: Any) -> Any:
             " state that model.add returns."
         )
     return given.detach().cpu()
+
+
+def warn_of_slow(name: str, rate: float) -> None:
+    """Warn of a growth rate, 1/h, that looks like one per minute."""
+    if 0 < rate < SLOW:
+        warn(
+            f"{name} is {rate:g} per hour: a doubling takes {math.log(2.0) / rate:.0f} h. Rates are"
+            f" per hour; a rate per minute is to be multiplied by 60 ({60 * rate:g})."
+        )
