@@ -23,6 +23,7 @@ from torchfilm.tools.warn_once import warn
 from torchfilm.values import smallest
 
 TOO_MANY = 1e9  # cells of a colony
+UNHEARD_OF = 1e6  # rate times hours, from which the first step fails and says so
 HARDLY_SLOWED = 1e4  # μ·µm, the length drag above which pressure hardly slows growth
 
 if TYPE_CHECKING:
@@ -98,8 +99,9 @@ def warn_of_too_many(effects: Sequence[BoundEffect], state: State, until: float)
     if not any(e.effect.divides_at_threshold for e in effects) or any(map(_may_hold, effects)):
         return
     fastest = float(rate.detach().max())
-    if fastest * (until - state.time) > math.log(TOO_MANY):
-        power = fastest * (until - state.time) / math.log(10.0)
+    grown = fastest * (until - state.time)  # of the logarithm
+    if math.log(TOO_MANY) < grown < UNHEARD_OF:
+        power = grown / math.log(10.0)
         warn(
             f"until = {until:g} h: at {fastest:.3g}/h, a cell becomes 10^{power:.0f} cells by then."
             " Are times in hours, and rates in 1/h? Else end the run at a number of cells, too"

@@ -454,10 +454,3 @@ def test_gradients_go_through_maintenance():
         )
     )
     assert float(slope) == pytest.approx((more - less) / 2e-4, rel=1e-5) and float(slope) < -0.1
-
-
-@pytest.mark.parametrize("rate", [0.0247, {0: 0.01, 1: 0.04}, [0.02, 0.03]])
-def test_a_rate_per_minute_is_warned_of(rate):
-    with pytest.warns(UserWarning, match=r"Monod\.rate is 0\.0\d+ per hour.*multiplied by 60"):
-        eating(tf.Monod("food", rate=rate)).bind(2)
-    eating(tf.Monod("food", rate=tf.Uniform(0.01, 1.0))).bind(2)

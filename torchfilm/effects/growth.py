@@ -16,7 +16,7 @@ from torchfilm.resolver import Values
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.doubling import check_doubling
-from torchfilm.tools.row_checks import check_field, check_variable, warn_of_slow
+from torchfilm.tools.row_checks import check_field, check_variable
 from torchfilm.tools.warn_once import warn
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, numbers, physical
 
@@ -305,7 +305,13 @@ class _BoundGrowth(BoundEffect):
         self.warn_of_others()
         if self.effect.law == "linear" or self.effect.rate is None or not state.cells:
             return
-        warn_of_slow("Growth.rate", float(state.growth_rate.detach().median()))
+        usual = float(state.growth_rate.detach().median())
+        if 0 < usual < 0.05:
+            warn(
+                f"Growth.rate is {usual:g} per hour: a doubling takes"
+                f" {math.log(2.0) / usual:.0f} h. Rates are per hour; a rate per minute is to"
+                f" be multiplied by 60 ({60 * usual:g})."
+            )
 
     def check_given(self, state: State, free: Container[str]) -> None:
         if "growth_rate" not in free:

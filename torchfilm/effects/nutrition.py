@@ -19,7 +19,7 @@ from torchfilm.signals.compiled_uptake import EVENTS
 from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.doubling import check_doubling
-from torchfilm.tools.row_checks import check_variable, warn_of_slow
+from torchfilm.tools.row_checks import check_variable
 from torchfilm.values import CONCENTRATION, Value, is_drawn, numbers, physical
 
 CONSTANTS = ("rate", "half", "growth_yield")
@@ -143,7 +143,6 @@ class Monod(Effect):
                 "Monod sets the growth rate, but Growth has a rate of its own, which would be"
                 " overwritten: write Growth()."
             )
-        warn_of_slow("Monod.rate", float(numbers(self.rate).max()))
 
 
 class BoundMonod(BoundEffect):

@@ -3,7 +3,6 @@ colonies."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
@@ -19,7 +18,6 @@ from torchfilm.tools.warn_once import warn
 # What a user may give where whole numbers, or numbers, are wanted in a row.
 Rows = Tensor | np.ndarray | Sequence[int]
 Numbers = Tensor | np.ndarray | Sequence[float]
-SLOW = 0.05  # 1/h, a growth rate
 WHOLE = (torch.int64, torch.int32)  # of which torch takes rows
 
 
@@ -337,12 +335,3 @@ def without_gradient(name: str, given: Any) -> Any:
             " state that model.add returns."
         )
     return given.detach().cpu()
-
-
-def warn_of_slow(name: str, rate: float) -> None:
-    """Warn of a growth rate, 1/h, that looks like one per minute."""
-    if 0 < rate < SLOW:
-        warn(
-            f"{name} is {rate:g} per hour: a doubling takes {math.log(2.0) / rate:.0f} h. Rates are"
-            f" per hour; a rate per minute is to be multiplied by 60 ({60 * rate:g})."
-        )
