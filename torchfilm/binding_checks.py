@@ -98,7 +98,8 @@ def warn_of_too_many(effects: Sequence[BoundEffect], state: State, until: float)
         return
     if not any(e.effect.divides_at_threshold for e in effects) or any(map(_may_hold, effects)):
         return
-    fastest = float(rate.detach().max())
+    drawn = state.declared["growth_rate"].at_division == "reset"  # again for each daughter
+    fastest = float(rate.detach().mean() if drawn else rate.detach().max())
     grown = fastest * (until - state.time)  # of the logarithm
     if math.log(TOO_MANY) < grown < UNHEARD_OF:
         power = grown / math.log(10.0)

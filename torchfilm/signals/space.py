@@ -27,9 +27,10 @@ def checked_box(
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     """Returns the lower corner, the upper corner and the size of voxels, checked."""
     try:
-        if any(isinstance(x, str) for corner in box for x in corner):
+        corners = [tuple(corner) for corner in box]
+        if any(isinstance(x, str) for corner in corners for x in corner):
             raise TypeError("texts")
-        low, high = (tuple(float(x) for x in corner) for corner in box)
+        low, high = (tuple(float(x) for x in corner) for corner in corners)
     except (TypeError, ValueError) as error:
         raise checks.input_error(
             "Medium.box", box, "two corners, such as ((-64, -64), (64, 64))"

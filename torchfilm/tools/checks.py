@@ -369,9 +369,10 @@ def choice(name: str, given: object, allowed: Sequence[object]) -> None:
 def vector(name: str, given: object, size: int | None = None) -> tuple[float, ...]:
     """Returns a short tuple of finite numbers, or raises InputError."""
     try:
-        if any(isinstance(x, str) for x in given):  # type: ignore[attr-defined]
+        entries = tuple(given)  # type: ignore[arg-type]
+        if any(isinstance(x, str) for x in entries):
             raise TypeError("texts")
-        out = tuple(float(x) for x in given)  # type: ignore[attr-defined]
+        out = tuple(float(x) for x in entries)
     except (TypeError, ValueError) as error:
         raise input_error(name, given, "a sequence of numbers") from error
     if size is not None and len(out) != size:
