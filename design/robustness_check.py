@@ -118,7 +118,7 @@ def _sizes(target: Target, given: Sequence[float] | None) -> Sequence[float]:
     seen = observed_at(target)
     if given is None:
         return USUAL if seen is None else ()
-    if seen is not None and not (isinstance(given, Sequence) and len(given) == 0):
+    if seen is not None and np.size(given):
         rule = f"left out, since the data were observed at {seen:g} h"
         raise checks.input_error("sizes", given, rule)
     return given
