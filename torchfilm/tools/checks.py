@@ -369,7 +369,7 @@ def choice(name: str, given: object, allowed: Sequence[object]) -> None:
 def vector(name: str, given: object, size: int | None = None) -> tuple[float, ...]:
     """Returns a short tuple of finite numbers, or raises InputError."""
     try:
-        entries = tuple(given)  # type: ignore[arg-type]
+        entries: tuple[Any, ...] = tuple(given)  # type: ignore[arg-type]
         if any(isinstance(x, str) for x in entries):
             raise TypeError("texts")
         out = tuple(float(x) for x in entries)
