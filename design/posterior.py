@@ -301,5 +301,6 @@ def _most_frequent(values: np.ndarray) -> Value:
 
 def _column(values: list[Value]) -> np.ndarray:
     """(S,); options of several kinds, such as "auto" and 3, stay what they are."""
-    several = len({type(value) for value in values}) > 1
+    kinds = {type(value) for value in values}
+    several = len(kinds) > 1 and not kinds <= {int, float}
     return np.array(values, dtype=object if several else None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import numbers
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING
@@ -214,7 +215,7 @@ class Bands(ProfileTarget):
             or len(edges) != len(self.species) + 1
         ):
             raise checks.input_error("Bands.edges", edges, rule)
-        if not all(isinstance(e, (int, float)) and not math.isnan(e) for e in edges) or any(
+        if not all(isinstance(e, numbers.Real) and not math.isnan(e) for e in edges) or any(
             a >= b for a, b in itertools.pairwise(edges)
         ):
             raise checks.input_error("Bands.edges", edges, rule)

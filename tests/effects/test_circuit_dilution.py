@@ -56,3 +56,40 @@ def test_molecules_are_kept_so_they_are_diluted():
     with pytest.raises(tf.InputError, match=r"dilution = False is not allowed.*molecules"):
         reactions = [tf.Reaction.of("a -> 0", 1.0)]
         tf.Circuit(reactions, species="a", method="direct", dilution=False)
+
+
+WRITTEN = {
+    "a term": lambda u, s, p, cell: {"yfp": p.k - cell.growth_rate * u.yfp},
+    "a factor": lambda u, s, p, cell: {"yfp": cell.growth_rate * (p.k - u.yfp)},
+    "beside a decay": lambda u, s, p, cell: {"yfp": p.k - (0.5 + cell.growth_rate) * u.yfp},
+    "a reaction": [
+        tf.Reaction({}, {"yfp": 1}, lambda u, s, p, cell: p.k),
+        tf.Reaction({"yfp": 1}, {}, lambda u, s, p, cell: cell.growth_rate * u.yfp),
+    ],
+    "of one type": {0: lambda u, s, p, cell: {"yfp": p.k - cell.growth_rate * u.yfp}},
+}
+
+
+def bound(rates, dilution):
+    circuit = tf.Circuit(rates, species=["yfp", "cfp"], k=2.0, dilution=dilution)
+    return tf.Scene(tf.Growth(rate=0.7), circuit, founders=tf.Cells.single(2), dt=0.1).bind()
+
+
+@pytest.mark.parametrize("rates", WRITTEN.values(), ids=WRITTEN)
+def test_dilution_that_the_rates_contain_as_well_gets_a_warning(rates):
+    with pytest.warns(UserWarning, match=r"'yfp' loses cell\.growth_rate·yfp, and growth dilutes"):
+        bound(rates, True)
+    with pytest.warns(UserWarning, match="growth dilutes it besides, twice in all"):
+        bound(rates, ["yfp"])
+
+
+@pytest.mark.filterwarnings("error")
+def test_rates_that_may_lose_a_species_by_growth_get_no_warning():
+    for rates in WRITTEN.values():
+        bound(rates, False)
+        bound(rates, ["cfp"])
+    # more is made in cells that grow faster
+    faster = lambda u, s, p, cell: {"yfp": p.k * cell.growth_rate * u.cfp - 2 * u.yfp}
+    bound(faster, True)
+    # an enzyme that is made as cells grow
+    bound(lambda u, s, p, cell: {"yfp": p.k - cell.growth_rate * u.yfp / (1 + u.yfp)}, True)

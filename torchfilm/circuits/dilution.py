@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.circuits.expressions import derivatives
+from torchfilm.circuits.graph import CircuitGraph
 from torchfilm.physics import capsule
 from torchfilm.tools.numba_calls import as_array, unavailable
 from torchfilm.tools.tangents import scaled, tracked
@@ -85,3 +87,19 @@ class Start:
         """In cells that nothing but growth changes, (N,)."""
         by, own = self.half.after, self.diluted
         return {n: scaled(x, by) if n in own else x for n, x in self._half_way.items()}
+
+
+def written_dilution(graph: CircuitGraph) -> list[str]:
+    """The species whose rates lose cell.growth_rate times their own level: ∂²rate/∂rate of growth
+    ∂level is −1 everywhere."""
+    make, found = graph.builder, []
+    growth = make.name("cell.growth_rate")
+    for name, rate in graph.rates.items():
+        by_growth = derivatives(make, [rate], growth).get(rate)
+        level = make.name(f"u.{name}")
+        both = derivatives(make, [by_growth], level).get(by_growth) if by_growth else None
+        if both is not None:
+            slopes = replace(graph, rates={name: both}, releases={}).at_random(0, 0.2, 2.0)
+            if len(slopes) and np.allclose(slopes, -1.0, rtol=1e-9, atol=0.0):
+                found.append(name)
+    return found

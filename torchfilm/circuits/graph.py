@@ -239,8 +239,8 @@ class CircuitGraph:
         values of all names between 0.2 and 2, and checked at others over eight decades. Where rates
         are not finite at any of them, no sum is found."""
         rows = [*self.rates, *(f"out.{n}" for n in self.releases)]
-        near, far = self._at_random(0, 0.2, 2.0), self._at_random(1, 1e-4, 1e4)
-        check = np.concatenate([self._at_random(2, 0.2, 2.0), far])
+        near, far = self.at_random(0, 0.2, 2.0), self.at_random(1, 1e-4, 1e4)
+        check = np.concatenate([self.at_random(2, 0.2, 2.0), far])
         still = [{n: 1} for n in self.species if n not in self.rates]
         found = []
         for weights in null_space(near if len(near) else far):
@@ -250,7 +250,7 @@ class CircuitGraph:
                 found.append({n: w for n, w in zip(rows, weights, strict=True) if w})
         return still + found
 
-    def _at_random(self, seed: int, low: float, high: float) -> np.ndarray:
+    def at_random(self, seed: int, low: float, high: float) -> np.ndarray:
         """Rates of amounts in a cell of volume 1 at PLACES random places, all values from low to
         high, even by their logarithms; (K, rows), of the places where all are finite."""
         rng = np.random.default_rng(seed)

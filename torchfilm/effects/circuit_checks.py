@@ -11,6 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from torchfilm.circuits import integrators
+from torchfilm.circuits.dilution import written_dilution
 from torchfilm.circuits.names import unknown
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.signals.schedule import Schedule
@@ -235,10 +236,13 @@ def check_levels(circuit: Any, fields: Mapping[str, Tensor], free: Container[str
             check_field(fields, name, lambda x: x < 0, "at least 0")
 
 
-def check_read(circuit: Any, read: set[str]) -> None:
-    """Raise InputError for a constant of a circuit that looks like another name, and warn of one
-    that no rate reads."""
-    given = circuit.parameters
+def check_read(circuit: Any, seen: Mapping[str, set[str]]) -> None:
+    """Raise InputError for a constant of a circuit that looks like another name; warn of one that
+    no rate reads, and of dilution that is counted twice. seen: the names that rates read, of
+    constants, "p", and of cells, "cell"."""
+    given, read = circuit.parameters, seen["p"]
+    if circuit.dilution and "growth_rate" in seen["cell"]:
+        _warn_of_dilution(circuit)
     own = {f.name for f in dataclasses.fields(circuit)}
     options = sorted(own - {"rates", "species", "parameters"})
     for name in given:
@@ -254,3 +258,19 @@ def check_read(circuit: Any, read: set[str]) -> None:
         like = difflib.get_close_matches(name, known, 1)
         hint = f". Did you mean {like[0]!r}?" if like else f": remove it, or use it as p.{name}."
         warn(f"Circuit.{name} is a constant that no rate reads{hint}")
+
+
+def _warn_of_dilution(circuit: Any) -> None:
+    """Warn where rates lose what growth dilutes besides. Rates that cannot be written as equations
+    are not looked at."""
+    try:
+        graphs = circuit.graphs.values()
+    except checks.InputError:
+        return
+    diluted = circuit.species if circuit.dilution is True else circuit.dilution
+    for name in dict.fromkeys(n for g in graphs for n in written_dilution(g) if n in diluted):
+        warn(
+            f"{circuit.value_owner()}: the rate of {name!r} loses cell.growth_rate·{name}, and"
+            " growth dilutes it besides, twice in all. Leave that term out of the rates, or give"
+            " dilution=False."
+        )
