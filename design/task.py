@@ -157,7 +157,7 @@ class Task(TaskOptions):
             )
         if until is not None and self.cells is None and tried.growth * until > math.log(TOO_MANY):
             power = tried.growth * until / math.log(10.0)
-            words = f"at {tried.growth:.3g}/h, a cell becomes 10^{power:.0f} cells by then"
+            words = f"at {tried.growth:.3g}/h, volumes grow 10^{power:.0f}-fold by then"
             hint = "Are times in hours, and rates in 1/h?"
             if tried.growth * until > math.log(NEVER):
                 raise tf.InputError(f"until = {until:g} h is not allowed: {words}. {hint}")

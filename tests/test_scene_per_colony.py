@@ -175,3 +175,20 @@ def test_columns_of_texts_are_no_numbers():
     for given in (Column(["a", "b"]), Column(np.array([1, None], dtype=object)), np.array(["a"])):
         with pytest.raises(InputError, match=r"Growth\.rate = .*must be a number, or numbers"):
             tf.Growth(rate=given)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (np.array([True, False]), r"Growth\.rate is bool of shape \(2,\)"),
+        (torch.tensor([True, False]), r"Growth\.rate is bool of shape \(2,\)"),
+        (np.array([1j, 2.0]), r"Growth\.rate is complex128 of shape \(2,\)"),
+        (np.ones((2, 3)), r"is float64 of shape \(2, 3\): it must be one number, or a 1-D tensor"),
+        ([True, False], r"Growth\.rate = \[True, False\] is not allowed"),
+        ([0.5, True], r"Growth\.rate = \[0\.5, True\] is not allowed"),
+    ],
+    ids=str,
+)
+def test_entries_that_are_no_real_numbers_are_refused_with_their_type(given, words):
+    with pytest.raises(InputError, match=words):
+        tf.Growth(rate=given)

@@ -200,7 +200,7 @@ def test_colonies_that_stand_still_are_named_after_others_have_left():
 
 
 FREE = tf.Growth(rate=1.5), tf.Division(length=4.0)
-HOURS = r"until = 60 h: at 1\.5/h, a cell becomes 10\^39 cells by then\. Are times in hours"
+HOURS = r"until = 60 h: at 1\.5/h, volumes grow 10\^39-fold by then\. Are times in hours"
 
 
 @pytest.mark.parametrize("more", [(), (tf.Mechanics(dim=2),)], ids=["alone", "contacts"])

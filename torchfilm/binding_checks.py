@@ -20,11 +20,9 @@ from torchfilm.tools import checks, row_checks
 from torchfilm.tools.hashing import trained
 from torchfilm.tools.tangents import tracked
 from torchfilm.tools.warn_once import warn
-from torchfilm.values import smallest
 
 TOO_MANY = 1e9  # cells of a colony
 UNHEARD_OF = 1e6  # rate times hours, from which the first step fails and says so
-HARDLY_SLOWED = 1e4  # μ·µm, the length drag above which pressure hardly slows growth
 
 if TYPE_CHECKING:
     from torchfilm.model import Model
@@ -104,26 +102,18 @@ def warn_of_too_many(effects: Sequence[BoundEffect], state: State, until: float)
     if math.log(TOO_MANY) < grown < UNHEARD_OF:
         power = grown / math.log(10.0)
         warn(
-            f"until = {until:g} h: at {fastest:.3g}/h, a cell becomes 10^{power:.0f} cells by then."
+            f"until = {until:g} h: at {fastest:.3g}/h, volumes grow 10^{power:.0f}-fold by then."
             " Are times in hours, and rates in 1/h? Else end the run at a number of cells, too"
             " (cells=…)."
         )
 
 
 def _may_hold(bound: BoundEffect) -> bool:
-    """Whether an effect may keep a colony from growing at its rate: it removes cells, sets rates,
-    has walls, or lets pressure slow growth."""
+    """Whether an effect may keep a colony from growing at its rate, sets rates, or removes
+    cells."""
     effect, writes = bound.effect, bound.writes()
-    slow = getattr(effect, "length_drag", None)
-    return (
-        is_own(effect)
-        or effect.writes_anything
-        or "growth_rate" in writes
-        or ("cells" in writes and not effect.divides_at_threshold)
-        or not getattr(effect, "is_plain", True)
-        or bool(getattr(effect, "walls", ()))
-        or (slow is not None and smallest(slow) < HARDLY_SLOWED)
-    )
+    removes = "cells" in writes and not effect.divides_at_threshold
+    return is_own(effect) or effect.holds_back or "growth_rate" in writes or removes
 
 
 def _why_none_divides(effects: Sequence[BoundEffect]) -> str:

@@ -75,15 +75,11 @@ class Effect(metaclass=checks.KnownKeywords):
 
     stage: ClassVar[int]
     title: ClassVar[str]
-    # May a scene list it more than once?
-    may_repeat: ClassVar[bool] = True
+    may_repeat: ClassVar[bool] = True  # may a scene list it more than once?
     instead_of_two: ClassVar[str] = "Put all of it into one."
-    # What it reads and writes is known only after it has been tried.
-    writes_anything: ClassVar[bool] = False
-    # Kernels compute its steps on the CPU, with few operations of torch between them.
-    by_kernels: ClassVar[bool] = False
-    # Its cost depends on the voxels of the grid, not on the cells.
-    works_on_grid: ClassVar[bool] = False
+    writes_anything: ClassVar[bool] = False  # what it reads and writes is seen as it is tried
+    by_kernels: ClassVar[bool] = False  # its steps on the CPU, with few operations of torch between
+    works_on_grid: ClassVar[bool] = False  # its cost depends on the voxels, not on the cells
     usual_first: ClassVar[float] = 1.0  # what hints suggest for a variable that it needs
     crowding: float = 0.0  # its cost for each cell grows as this power of a colony's cells
 
@@ -235,14 +231,18 @@ class Effect(metaclass=checks.KnownKeywords):
 
     @property
     def divides_at_threshold(self) -> bool:
-        """Whether it divides cells at a threshold, late in a step; not only those that a rule has
-        flagged, early in it."""
+        """Whether it divides cells at a threshold, not only those that a rule has flagged."""
         return False
 
     @property
     def soft_contacts(self) -> bool:
         """Whether its cells are physically soft, so that an overlap is no error."""
         return False
+
+    @property
+    def holds_back(self) -> bool:
+        """Whether it may keep colonies from growing at the rate of their cells."""
+        return self.writes_anything
 
     def wall_surfaces(self) -> Sequence[Any]:
         """Surfaces that confine cells."""

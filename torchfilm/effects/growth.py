@@ -146,6 +146,10 @@ class Growth(Effect):
         """Whether growth_rate is all that it goes by."""
         return not self.sets_rate and self.factor is None
 
+    @property
+    def holds_back(self) -> bool:
+        return not self.is_plain
+
     def needs(self) -> tuple[str, ...]:
         return (*self._paid(), *self._slowed())
 

@@ -188,6 +188,10 @@ class Mechanics(Effect):
     def soft_contacts(self) -> bool:
         return self.stiffness is not None
 
+    @property
+    def holds_back(self) -> bool:
+        return bool(self.walls) or smallest(self.length_drag) < FREE
+
     def wall_surfaces(self) -> list[Surface]:
         return self.surfaces()
 

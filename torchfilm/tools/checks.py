@@ -268,8 +268,11 @@ def value(
     if given.dim() > 1 or not (
         given.is_floating_point() or given.dtype in (torch.int32, torch.int64)
     ):
-        rule = "one number, or a 1-D tensor with one number per colony"
-        raise input_error(name, tuple(given.shape), rule)
+        kind = str(given.dtype).removeprefix("torch.")
+        raise InputError(
+            f"{name} is {kind} of shape {tuple(given.shape)}: it must be one number, or a 1-D"
+            " tensor of numbers, one per colony."
+        )
     given = given if given.is_floating_point() else given.double()
     detached = given.detach()
     good = torch.isfinite(detached) & (detached > above) & (detached >= least) & (detached <= most)

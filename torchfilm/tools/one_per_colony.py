@@ -33,6 +33,8 @@ def as_tensor(given: Any) -> Any:
     """A list, an array or a column of a data frame as a tensor of its own; anything else stays.
     Raises TypeError, ValueError or RuntimeError for what holds no numbers."""
     if isinstance(given, (list, tuple)):
+        if any(isinstance(x, (bool, np.bool_)) for x in given):
+            raise TypeError("True and False are no numbers")
         devices = [x.device for x in given if isinstance(x, Tensor)]
         if not devices:
             return torch.tensor(given, dtype=torch.float64)
