@@ -121,15 +121,21 @@ def test_bands_are_of_the_middle_cells_and_few_counts_are_even(tmp_path):
     assert (band.min(), band.max()) == pytest.approx((1.0, 9.0))
 
 
-def test_replicates_are_told_apart_by_their_colonies(tmp_path):
+def test_replicates_are_thin_lines_of_one_colour_beside_their_mean(tmp_path):
     path = tmp_path / "run.h5"
     circuit = tf.Circuit(makes, species="gfp", make=torch.tensor([1.0, 1.0, 2.0]))
-    tf.simulate(tf.Scene(circuit, dim=2, dt=0.1), until=0.5, record=path).last()
-    shown = lambda **which: [
-        text.get_text().replace("\u2009", " ")
-        for text in tf.pictures.time_course(path, "gfp", **which).figure.axes[0].get_legend().texts
-    ]
-    names = shown()
-    assert [n.rpartition(", ")[2] for n in names] == ["colony 0", "colony 1", "colony 2"]
-    assert len({*names}) == 3 and all(n.startswith("make = ") for n in names)
-    assert "colony" not in "".join(shown(colonies=[0, 2]))
+    first = {"gfp": torch.tensor([0.0, 3.0, 1.0])}
+    start = tf.Cells([[0.0, 0.0]] * 3, [[1.0, 0.0]] * 3, cell_type=[0] * 3,
+                     colony=[0, 1, 2], extra=first)  # fmt: skip
+    tf.simulate(tf.Scene(circuit, dim=2, founders=start, dt=0.1), until=0.5, record=path).last()
+    figure = tf.pictures.time_course(path, "gfp").figure
+    one, two, alone, mean = figure.axes[1].lines
+    assert one.get_color() == two.get_color() == mean.get_color() != alone.get_color()
+    assert one.get_linewidth() == two.get_linewidth() < mean.get_linewidth()
+    np.testing.assert_allclose(mean.get_ydata(), (one.get_ydata() + two.get_ydata()) / 2)
+    assert abs(one.get_ydata() - two.get_ydata()).max() > 1.0
+    shown = [text.get_text().replace("\u2009", " ") for text in figure.axes[0].get_legend().texts]
+    assert shown == ["make = 2", "make = 1, mean of 2"]
+    # by kind, they are told apart by their colonies
+    split = tf.pictures.time_course(path, "gfp", by="cell_type").figure.axes[0].get_legend().texts
+    assert [t.get_text().split(", ")[1] for t in split] == ["colony 0", "colony 1", "colony 2"]

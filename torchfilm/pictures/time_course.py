@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +41,9 @@ def time_course(
     dpi: float = 160,
 ) -> Picture:
     """Draw the number of cells of each colony against time, and below it the mean of each quantity
-    over its cells; of up to four lines also the band from 10 to 90 % of the cells.
+    over its cells; of up to four lines also the band from 10 to 90 % of the cells. Replicates,
+    which are colonies of the same parameters, are thin lines of one colour, beside the mean of
+    those that have cells.
 
     what: a results file, or its path. quantities: fields of the cells, or signals at them as
     "out.NAME". by: a field of whole numbers, such as "cell_type": cells of each are counted apart,
@@ -62,18 +65,16 @@ def time_course(
         none = np.full((1 + len(quantities), 3), np.nan)
         seen = np.stack([[one.get((x.place, x.kind), none) for x in lines] for one in found])
         figure = new_figure(WIDE, HIGH * (1 + len(quantities)) + 0.3, dpi)
-        axes = figure.subplots(1 + len(quantities), 1, sharex=True, squeeze=False)[:, 0]
+        axes = list(figure.subplots(1 + len(quantities), 1, sharex=True, squeeze=False)[:, 0])
+        seen[:, :, 0][seen[:, :, 0] == 0] = np.nan
+        each_label = Counter(x.label for x in lines)
         for k, line in enumerate(lines):
-            drawn: dict[str, Any] = {"color": line.colour, "ls": line.style, "lw": 1.2}
-            counts = seen[:, k, 0, 0]
-            alive = np.where(counts > 0, counts, np.nan)
-            axes[0].plot(results.times, alive, label=line.label, **drawn)
-            for row in range(len(quantities)):
-                mean, low, high = seen[:, k, 1 + row].T
-                axes[1 + row].plot(results.times, mean, **drawn)
-                if len(lines) <= FEW:
-                    axes[1 + row].fill_between(results.times, low, high, color=line.colour,
-                                               alpha=0.2, lw=0)  # fmt: skip
+            band, several = len(lines) <= FEW, each_label[line.label] > 1
+            _draw(axes, results.times, seen[:, k], line, band and not several, several)
+        for label in (n for n, count in each_label.items() if count > 1):
+            same = [k for k, x in enumerate(lines) if x.label == label]
+            first = replace(lines[same[0]], label=f"{label}, mean of {len(same)}")
+            _draw(axes, results.times, _mean(seen[:, same]), first)
         counts = np.nan_to_num(seen[:, :, 0, 0])
         some = counts[counts > 0].min(initial=np.inf)
         _finish(axes[0], "cells", log=bool(counts.max(initial=0.0) > TENFOLD * max(1, some)))
@@ -98,18 +99,42 @@ class CourseLine:
     style: str
 
 
+def _draw(
+    axes: Sequence[Axes], times: np.ndarray, seen: np.ndarray, line: CourseLine,
+    band: bool = False, thin: bool = False,
+) -> None:  # fmt: skip
+    """Draw one line in each panel, and below the first the band of the cells. seen: of each frame,
+    (frames, panels, 3): the value, and the ends of the band. thin: one of several replicates."""
+    width: dict[str, Any] = {"lw": 0.5, "alpha": 0.7} if thin else {"lw": 1.2}
+    label = None if thin else line.label
+    for row, ax in enumerate(axes):
+        value, low, high = seen[:, row].T
+        ax.plot(times, value, color=line.colour, ls=line.style, label=label, **width)
+        if band and row:
+            ax.fill_between(times, low, high, color=line.colour, alpha=0.2, lw=0)
+
+
+def _mean(seen: np.ndarray) -> np.ndarray:
+    """The mean of colonies, (frames, colonies, panels, 3), that have cells; NaN where none has."""
+    some = ~np.isnan(seen)
+    total = np.where(some, seen, 0.0).sum(1)
+    return np.divide(total, some.sum(1), out=np.full_like(total, np.nan), where=some.any(1))
+
+
 def _lines(
     places: Sequence[int], kinds: Sequence[int], by: str | None, frames: RecordedFrames
 ) -> list[CourseLine]:
-    """One for each colony, or for each kind of each."""
+    """One for each colony, or for each kind of each. Without kinds, replicates have the label and
+    the colour in common."""
     named = {p: frames[0].name(p) for p in places}
-    if len({*named.values()}) < len(named):  # replicates have the same parameters
+    labels = list(dict.fromkeys(named.values()))
+    if by is None:
+        colours = dict(zip(labels, _colours(len(labels)), strict=True))
+        return [CourseLine(p, ALL, name, colours[name], "-") for p, name in named.items()]
+    if len(labels) < len(named):
         ids = frames.results.colony_id
         named = {p: f"{name}, colony {ids[p]}" for p, name in named.items()}
     name = named.__getitem__
-    if by is None:
-        colours = _colours(len(places))
-        return [CourseLine(p, ALL, name(p), c, "-") for p, c in zip(places, colours, strict=True)]
     if len(places) > len(STYLES):
         rule = f"up to {len(STYLES)} colonies where cells are told apart by {by!r}"
         raise checks.input_error("colonies", [name(p) for p in places], rule)
