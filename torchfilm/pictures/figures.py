@@ -364,7 +364,9 @@ def opened(what: object) -> Iterator[Results]:
         with Results(what) as results:
             yield results
     else:
-        hint = "A state is drawn by tf.show(state)."
+        hint = (
+            'States are drawn by tf.show(state); record a run by tf.simulate(…, record="run.h5").'
+        )
         if isinstance(what, Scene):
             hint = "Run the scene; its founders are tf.show(scene.bind().start(), scene=scene)."
         raise checks.input_error("results", what, "a results file, or its path", hint)
