@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from scipy.stats import binom
 from scipy.stats import t as student
 
 from design.entries import Entry
@@ -105,8 +106,8 @@ class Finals(metaclass=checks.KnownKeywords):
 @dataclass(frozen=True, eq=False)
 class FreshLosses:
     """A design on fresh seeds: losses (S,) of each, the worst of its sizes; loss: what they reduce
-    to; band: where that lies with a probability of 90 %, unless the design was `chosen` among
-    others by these losses."""
+    to; band: where that lies with a probability of 90 %, unless the design was `chosen` by these
+    losses: among others, or since it holds a wanted loss."""
 
     losses: np.ndarray
     loss: float
@@ -131,8 +132,15 @@ def _fresh(
     if len(losses) < LEAST:
         return None
     rivals = {p.tobytes() for p in _known(study)}
-    chosen = first == FIRST_STREAM and len(rivals) > 1
+    chosen = first == FIRST_STREAM and (len(rivals) > 1 or _was_to_hold(study, point))
     return FreshLosses(losses, float(task.reduced(losses[None])[0]), _band(task, losses), chosen)
+
+
+def _was_to_hold(study: Study, point: np.ndarray) -> bool:
+    """Whether a few seeds decided that a design (D,) was grown on more: a batch begins after
+    them."""
+    begin = FIRST_STREAM + HOLDS[0]
+    return any(e.streams[0] == begin and (e.points == point).all(1).any() for e in study.finals)
 
 
 def fresh_goals(
@@ -199,15 +207,38 @@ def is_certain(task: Task, study: Study) -> bool:
 
 def _is_mean(task: Task) -> bool:
     """Whether the loss of a design is the mean of those of its colonies."""
-    return task.reduce == "mean" and task.target.reduced(np.zeros((1, LEAST))) is None
+    return task.reduce == "mean" and not _reduces_itself(task)
+
+
+def seeds_of_an_end(task: Task) -> int:
+    """Seeds from which on the band of a quantile has an upper end; 1 where it always has one."""
+    if not _is_quantile(task):
+        return 1
+    return math.ceil(math.log(0.5 - BAND / 2) / math.log(float(task.reduce)))
+
+
+def _is_quantile(task: Task) -> bool:
+    """Whether the loss of a design is a quantile of those of its colonies, not of the worst."""
+    return isinstance(task.reduce, float) and task.reduce < 1 and not _reduces_itself(task)
+
+
+def _reduces_itself(task: Task) -> bool:
+    """Whether the target, such as a spread, makes one loss of those of the seeds."""
+    return task.target.reduced(np.zeros((1, LEAST))) is not None
 
 
 def _band(task: Task, losses: np.ndarray) -> tuple[float, float]:
-    """Student's interval of a mean; for a quantile, that of resampled losses."""
+    """Student's interval of a mean; the order statistics that enclose a quantile whatever the
+    distribution (David and Nagaraja, Order Statistics, 2003, 7.1), infinite where the seeds are too
+    few; else the interval of resampled losses."""
     if _is_mean(task):
         error = losses.std(ddof=1) / np.sqrt(len(losses))
         wide = float(student.ppf(0.5 + BAND / 2, len(losses) - 1) * error)
         return float(losses.mean()) - wide, float(losses.mean()) + wide
+    if _is_quantile(task):
+        found = binom.ppf([0.5 - BAND / 2, 0.5 + BAND / 2], len(losses), task.reduce)
+        ends = np.concatenate([[-np.inf], np.sort(losses), [np.inf]])
+        return float(ends[int(found[0])]), float(ends[int(found[1]) + 1])
     drawn = np.random.default_rng(0).choice(losses, (RESAMPLES, len(losses)))
     low, high = np.quantile(task.reduced(drawn), [0.5 - BAND / 2, 0.5 + BAND / 2])
     return float(low), float(high)
@@ -219,8 +250,10 @@ def winner(task: Task, study: Study, sizes: Sequence[float]) -> np.ndarray | Non
     fewer seeds on the seeds of these. None before a design was grown on fresh seeds."""
     found = ((_fresh(task, study, sizes, p, FIRST_STREAM), p) for p in _known(study))
     known = [(fresh, p) for fresh, p in found if fresh is not None]
-    # where every colony fails, a narrow band says nothing
-    ends = lambda x: (bool((x[0].losses == task.target.failed).all()), x[0].band[1])
+    # where every colony fails, a narrow band says nothing; few seeds set no end to a quantile
+    ends = lambda x: (
+        bool((x[0].losses == task.target.failed).all()), x[0].band[1], x[0].loss,
+    )  # fmt: skip
     if not known or _is_mean(task):
         return min(known, key=ends)[1] if known else None
     out: tuple[FreshLosses, np.ndarray] | None = None
@@ -292,7 +325,7 @@ class FinalsRun:
         return any(self._holds(point, wanted) for point in points.values())
 
     def _holds(self, point: np.ndarray, wanted: float) -> bool:
-        for seeds in HOLDS:
+        for seeds in (HOLDS[0], max(HOLDS[1], seeds_of_an_end(self.task))):
             if time.monotonic() >= self.deadline:
                 return False
             if not self._grow([point], seeds) or self._loss(seeds, point) > wanted:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from design.finals import FreshLosses
+from design.finals import FreshLosses, seeds_of_an_end
 from design.growing import FinishedColonies
 from design.parameters import Choice, Parameter, Space, Value, show_value
 from design.study import Study
@@ -138,6 +138,8 @@ def fresh_words(task: Task, fresh: FreshLosses) -> str:
 
 def show_loss(loss: float) -> str:
     """Four decimals, but of what is as large as the loss of a failed colony."""
+    if math.isinf(loss):
+        return "∞" if loss > 0 else "−∞"
     # without the sign of what rounds to 0
     return f"{round(loss, 4) + 0.0:.4f}" if abs(loss) < LARGE else f"{loss:.4g}"
 
@@ -154,6 +156,10 @@ def _seeds(task: Task, fresh: FreshLosses) -> str:
         return f"on {missed.sum()} of {seeds} seeds"
     low, high = fresh.band
     by = ", which chose it" if fresh.chosen else ""
+    if failed.any():
+        by += f"; {failed.sum()} of them failed, and count {show_loss(task.target.failed)}"
+    if math.isinf(high):
+        by += f"; an upper end takes {seeds_of_an_end(task)}"
     return f"{show_loss(low)} … {show_loss(high)}, {seeds} seeds{by}"
 
 

@@ -323,3 +323,39 @@ def test_gradients_pass_what_is_smooth_around_the_molecules(plain):
     assert "where gradients are required by torch" in tf.explain(scene)
     model = scene.bind(dtype=F64)
     assert dataclasses.is_dataclass(model.step(model.start(), 0.1))
+
+
+def test_leaps_that_are_halved_are_the_same(monkeypatch, plain):
+    """Leaps so long that many would take more molecules than there are, beside a gene that turns
+    on and off: what is critical fires at its time, or after a leap that was halved, not at all."""
+    loose = {"epsilon": 3.0, "critical": 2}
+    for name, value in loose.items():
+        monkeypatch.setitem(molecules_text.CONSTANTS, name.upper(), value)
+    by_torch, drawn, asked = stochastic.tau_leap, KeyedDraws.__call__, []
+    monkeypatch.setattr(stochastic, "tau_leap", lambda *a, **k: by_torch(*a, **k, **loose))
+    monkeypatch.setattr(
+        KeyedDraws, "__call__", lambda self, rows, event, what, count: (
+            asked.append(what), drawn(self, rows, event, what, count)
+        )[1],
+    )  # fmt: skip
+    circuit = molecules(
+        *parts.degradation("a", 20.0), tf.Reaction.of("off -> on", 10.0),
+        tf.Reaction.of("on -> off", 10.0), tf.Reaction.of("on -> on + 5 a", 200.0),
+        species=("a", "on", "off"), molecules_per_unit=1.0,
+        initial={"a": tf.Uniform(100.0, 200.0), "off": 0.5},
+    )  # fmt: skip
+    a, b = ends(alone(circuit, count=20), 3, colonies=3)
+    equal(a, b)
+    assert torch.equal(steps_of(a), steps_of(b))
+    assert asked.count("leap 1") > 10, "hardly a leap was halved"
+
+
+@both
+def test_of_several_wrong_propensities_the_first_is_named(method, plain):
+    wrong = lambda name, rate: tf.Reaction({}, {"a": 1}, rate, name)
+    circuit = molecules(
+        *parts.constitutive("a", 5.0), wrong("one", lambda u, s, p, cell: 0.0 * u.a - 1.0),
+        wrong("other", lambda u, s, p, cell: 0.0 * u.a - 2.0), species="a", method=method,
+    )  # fmt: skip
+    for state in ends(alone(circuit, count=3), 1):
+        assert "'one' has a propensity" in state.reports["circuit"].words[0]

@@ -10,7 +10,7 @@ from helpers import array
 from traced import alone, ends, equal
 
 import torchfilm as tf
-from torchfilm.circuits.dilution import Start, half_way
+from torchfilm.circuits.dilution import Start, half_way, part_way
 from torchfilm.physics import capsule
 
 F64 = torch.float64
@@ -124,3 +124,16 @@ def test_a_colony_without_a_value_is_refused():
     model = scene([1.0]).bind(1, seed=1)
     with pytest.raises(tf.InputError, match=r"colony_id = 2.*below 1"):
         model.step(three, 0.25)
+
+
+def test_part_way_the_volume_has_grown_by_that_part(dtype):
+    length = torch.tensor([2.0, 3.0, 0.0], dtype=dtype)
+    radius = torch.full((3,), 0.4).to(dtype)
+    own = capsule.volume(length, radius)
+    before = own * torch.tensor([1.0, 0.9, 0.9], dtype=dtype)
+    made = part_way(length, radius, before, 0.25)
+    wanted = before + 0.25 * (own - before)
+    wanted[2] = own[2]  # a sphere cannot have been smaller at this radius
+    close = 20 * torch.finfo(dtype).eps
+    assert array(capsule.volume(made, radius)) == pytest.approx(array(wanted), rel=close)
+    assert torch.equal(made[0], length[0]) and float(made[2]) == 0.0

@@ -476,3 +476,14 @@ def test_growth_faster_than_a_step_is_followed():
     )
     *_, state = tf.simulate(tf.Scene(circuit), dt=0.05, until=0.2)
     assert float(state.fields["a"]) == pytest.approx(1e-6 * math.exp(20.0), rel=2e-3)
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_two_species_that_make_each_other_run_away_and_are_named(backend):
+    """As one species that makes itself: a' = 10 b² and b' = 10 a², both from 0.7. No rate depends
+    on its own species, so that the diagonal of J is 0; growth shows in elimination alone."""
+    rates = lambda u, s, p, cell: {"a": 10.0 * u.b**2, "b": 10.0 * u.a**2}
+    circuit = tf.Circuit(rates, species=("a", "b"), initial={"a": 0.7, "b": 0.7}, backend=backend)
+    with pytest.raises(tf.SimulationError, match=r"step [34] .*\n.*: '[ab]' runs away, from"):
+        for _ in tf.simulate(tf.Scene(circuit), dt=0.05, until=1.0):
+            pass

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -14,7 +15,16 @@ from searching import lit, mean
 import torchfilm as tf
 from design import Finals, Measured, Parameter, Search, Sobol, Study, Target
 from design.entries import Entry
-from design.finals import CHECK_STREAM, FIRST_STREAM, HOLDS, LEAST, _band, is_certain, winner
+from design.finals import (
+    CHECK_STREAM,
+    FIRST_STREAM,
+    HOLDS,
+    LEAST,
+    _band,
+    is_certain,
+    seeds_of_an_end,
+    winner,
+)
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 
@@ -210,6 +220,37 @@ def test_the_band_of_a_mean_is_that_of_student():
     losses = np.array([0.1, 0.4, 0.2, 0.7, 0.3])
     wanted = stats.t.interval(0.9, 4, losses.mean(), losses.std(ddof=1) / np.sqrt(5))
     assert _band(search().objective.task, losses) == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize("quantile", [0.25, 0.5, 0.75, 0.9])
+@pytest.mark.parametrize("seeds", [4, 8, 16, 24, 40])
+def test_the_band_of_a_quantile_holds_for_skewed_losses(quantile, seeds):
+    task, random = search(reduce=quantile).objective.task, np.random.default_rng(0)
+    truth = stats.lognorm.ppf(quantile, 1.0)
+    bands = np.array([_band(task, random.lognormal(size=seeds)) for _ in range(1000)])
+    within = ((bands[:, 0] <= truth) & (truth <= bands[:, 1])).mean()
+    assert within >= 0.9 - 3 * np.sqrt(0.9 * 0.1 / 1000)
+    # each end is missed by at most one in twenty
+    for missed in (bands[:, 1] < truth, bands[:, 0] > truth):
+        assert missed.mean() <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / 1000)
+    assert np.isinf(bands[:, 1]).all() == (seeds < seeds_of_an_end(task))
+    assert np.isfinite(bands[:, 1]).all() == (seeds >= seeds_of_an_end(task))
+
+
+def test_the_table_says_how_many_seeds_set_an_end_to_a_quantile():
+    least = {q: seeds_of_an_end(search(reduce=q).objective.task) for q in (0.5, 0.75, 0.9)}
+    assert least == {0.5: 5, 0.75: 11, 0.9: 29}
+    assert seeds_of_an_end(search().objective.task) == 1
+    best = search(reduce=0.9).run(200, progress=False)
+    assert math.isinf(best.band[1]) and len(best.losses) < 29
+    assert f"∞, {len(best.losses)} seeds; an upper end takes 29" in best.table()
+
+
+def test_seeds_that_a_wanted_loss_was_held_on_have_chosen_the_design():
+    made = search(Lucky(most=0.0))
+    best = made.run(3000, stop_at=0.15, progress=False)
+    assert len(best.losses) == HOLDS[1] and best.fresh.chosen
+    assert "24 seeds, which chose it" in best.table()
 
 
 @pytest.mark.parametrize("reduce", ["worst", 0.75])

@@ -154,3 +154,36 @@ def test_a_small_cell_in_a_large_one_is_noticed(apart, words):
     founders = tf.Cells([[0.0, 0.0], [0.0, apart]], [1.0, 0.0], 0.0, radius=[0.6, 0.2])
     with pytest.warns(RuntimeWarning, match=words):
         tf.Scene(tf.Mechanics(dim=2), founders=founders).bind()
+
+
+SOFT = {
+    "cells": (TWO, {"stiffness": 50.0}),
+    "walls": (tf.Cells.single(2), {"walls": [tf.Box((-1.7, -9.0), (1.7, 9.0), stiffness=50.0)]}),
+}
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+@pytest.mark.parametrize("soft", SOFT)
+def test_what_is_soft_yields_in_sub_steps_as_in_short_steps(soft, backend):
+    """Sub-steps are steps of a part of the time. Growth by the same length in each, and tight
+    solves: what is left is rounding, 1e-16, times what the solve amplifies."""
+    founders, given = SOFT[soft]
+    scene = tf.Scene(
+        tf.Growth(rate=2.0, law="linear"),
+        tf.Mechanics(dim=2, length_drag=10.0, tolerance=1e-9, backend=backend, **given),
+        founders=founders,
+    )
+    model = scene.bind(dtype=torch.float64)
+    start = model.start()
+    once = model.step(start, 0.4)
+    parts = int(once.reports["mechanics"].substeps)
+    assert parts == 4
+    state = start
+    for _ in range(parts):
+        state = model.step(state, 0.1)
+        assert int(state.reports["mechanics"].substeps) == 1
+    for field in ("position", "length"):
+        torch.testing.assert_close(
+            getattr(once, field), getattr(state, field), rtol=0, atol=1e-7, msg=field
+        )
+    assert float((once.length - start.length).max()) < 0.79, "something presses them"

@@ -288,3 +288,16 @@ def test_a_colony_in_torch_does_not_depend_on_the_others(pretended_cuda, where):
         alone = model_.step(state.select([k]), 0.05)
         for field in ("position", "axis", "length", "displacement", "contact_alpha"):
             assert torch.equal(getattr(alone, field), getattr(last.select([k]), field)), (k, field)
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_free_growth_is_no_stock_of_length_that_pressure_may_take(backend):
+    """A cell may become shorter by a share of its whole length than it once was; what it has grown
+    by before does not add to that."""
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, backend=backend), dt=0.05)
+    model = scene.bind(dtype=F64)
+    start = state = model.start()
+    for _ in range(5):
+        state = model.step(state)
+    assert float(state.length) > float(start.length) + 0.5
+    assert state.compression.tolist() == [0.0]

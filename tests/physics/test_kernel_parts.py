@@ -14,7 +14,16 @@ import pytest
 import torch
 
 import torchfilm as tf
-from torchfilm.kernels import colonies, contacts, functions, lanes, moves, neighbours, wall_moves
+from torchfilm.kernels import (
+    colonies,
+    contacts,
+    found,
+    functions,
+    lanes,
+    moves,
+    neighbours,
+    wall_moves,
+)
 from torchfilm.kernels.compiling import for_python
 from torchfilm.kernels.memory import no_memory
 from torchfilm.physics import substeps
@@ -260,3 +269,46 @@ def test_sums_in_any_order_write_to_no_array():
                 ]
                 assert stored == [], node.name
     assert len(found) >= 2
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+@pytest.mark.parametrize("turns", (True, False))
+def test_a_move_through_a_wall_is_cut_whether_it_turns_or_not(dim, turns):
+    """A rod of 6 µm just above a floor turns by 0.49 rad about its centre, or sinks by 1.4 µm: in
+    both cases a point of it comes more than a radius, 0.5 µm, behind the floor. The share that is
+    left is interpolated: that of a turn to the difference of an angle and its sine, 4 %."""
+    x, axis = np.zeros((1, dim)), np.zeros((1, dim))
+    x[0, 1], axis[0, 0] = 0.55, 1.0
+    dof, radius, least = DOF[dim], np.full(1, 0.5), np.zeros(1)
+    length, y = np.full(1, 6.0), np.zeros((1, len(dof)))
+    y[0, 2 if dim == 2 else 5], y[0, 1] = (0.49, 0.0) if turns else (0.0, -1.4)
+    none = np.zeros(1, bool)
+    floor = np.zeros(1, np.int64), np.array([[0.0, 1.0, 0.0]]), np.zeros(1), none, np.ones((1, 1))
+    given = np.ones_like(y), np.zeros_like(y), 1e9, least, floor, np.zeros((3, len(dof))), dof
+    assert for_python(wall_moves.move_cells)(x, axis, length, radius, y, *given) == 1
+    lowest = x[0, 1] - 3.0 * abs(axis[0, 1])
+    assert -0.05 < lowest < 1e-12
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+@pytest.mark.parametrize("count", (40, 300))
+@pytest.mark.parametrize("both", (True, False))
+def test_cells_that_a_move_brings_into_each_other_are_found(dim, count, both):
+    """Balls 9 µm apart on a line, and two farther from each other than the margin, which was no
+    contact: then one comes 0.55 µm nearer, or both half of that, and they lie 0.15 µm deep."""
+    dof, margin, deep, board = DOF[dim], 0.3, 0.1, np.zeros(0, np.int64)
+    x, axis = np.zeros((count, dim)), np.zeros((count, dim))
+    x[:, 0], axis[:, 1] = 9.0 * np.arange(count), 1.0
+    x[1, 0] = x[0, 0] + 1.4
+    radius, length, y = np.full(count, 0.5), np.zeros(count), np.zeros((count, len(dof)))
+    half, cells = 0.5 * length, (x, axis, 0.5 * length, radius, NONE)
+    before = for_python(found.found_contacts)(no_memory(), board, *cells, margin, dof)
+    assert before[2].size == 0
+    y[:2, 0] = (0.275, -0.275) if both else (0.0, -0.55)
+    x += y[:, :dim]
+    arrays = length, length, half, length, length, length, y, y, y
+    after, deeply = for_python(found.found_after)(
+        no_memory(), board, x, axis, radius, NONE, margin, deep, before, arrays, dof
+    )
+    assert deeply and after[2].size == 1 and after[4][0] == pytest.approx(-0.15)
+    assert (after[0][after[2][0]], after[1][after[2][0]]) == (0, 1)

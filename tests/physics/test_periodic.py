@@ -484,3 +484,41 @@ def test_measures_see_neighbours_across_faces():
     assert tf.measure.clusters(state, 0.2).tolist() == [0, 0, 1]
     assert float(tf.measure.overlaps(state).worst) == pytest.approx(0.3)
     assert float(tf.measure.alike_neighbours(state, 0.2)) == 1.0
+
+
+@pytest.mark.parametrize("dim, axes", AXES)
+@pytest.mark.parametrize("count", (30, 200))
+def test_near_pairs_of_some_cells_are_found_across_faces(dim, axes, count):
+    """Those of all near pairs that have a marked cell, whether it or its image is met."""
+    space = space_of(dim, axes)
+    x, axis, length, radius = crowd(count, count, dim)
+    periods = np.array([*space.period, 0.0][:3])
+    given = no_memory(), x, axis, 0.5 * length, radius, periods, 0.3
+    every = np.stack(for_python(neighbours.near_pairs)(*given, DOF[dim]), 1)
+    for share in (0.05, 0.5):
+        some = (np.random.default_rng(count).random(count) < share).astype(np.uint8)
+        found = np.stack(for_python(neighbours.near_pairs_of)(*given, some, DOF[dim]), 1)
+        wanted = every[(some[every] > 0).any(1)]
+        assert sorted(map(tuple, found.tolist())) == sorted(map(tuple, wanted.tolist()))
+        assert count < 200 or 0 < len(wanted) < len(every)
+
+
+@pytest.mark.parametrize("backend", ("compiled", "torch"))
+@pytest.mark.parametrize(("dim", "along"), [(2, "y"), (3, "y"), (3, "z")])
+def test_cells_stick_together_across_the_faces_of_every_axis(backend, dim, along):
+    """Two cells, one at either face, 0.1 µm apart, are held as two in the middle are."""
+    glue, found, k = tf.Adhesion(strength=300.0, reach=0.3), [], "xyz".index(along)
+    for shift in (0.0, 10.0):
+        position = np.full((2, dim), 5.0)
+        position[:, k] = np.array([19.45 + shift, 0.55 + shift]) % 20.0
+        cells = tf.Cells(position=position, axis=[np.eye(dim)[0]] * 2, length=2.0)
+        scene = tf.Scene(
+            tf.Mechanics(dim=dim, adhesion=[glue], periodic={along: (0, 20)}, backend=backend),
+            dt=0.02,
+        )
+        model = scene.bind(cells=cells, dtype=torch.float64)
+        state = model.start()
+        for _ in range(5):
+            state = model.step(state)
+        found.append(float(tf.measure.neighbours(state, 0.3)[2]))
+    assert found[0] == pytest.approx(found[1], abs=1e-9) and 0.98 < found[0] < 1.05
