@@ -282,3 +282,25 @@ def test_how_far_cells_moved_is_counted_across_faces():
     apart = cells.relaxed(periodic={"x": (0.0, 20.0)})
     assert apart.position[0, 0] > 19.0
     assert np.all((apart.micrograph.moved > 0.1) & (apart.micrograph.moved < 0.5))
+
+
+def test_a_state_of_another_scene_has_the_space_of_the_model_that_steps_it():
+    with_faces = tf.Scene(tf.Mechanics(dim=2, periodic={"x": (0, 40)}))
+    without = tf.Scene(tf.Mechanics(dim=2))
+    state = with_faces.bind().start()
+    assert state.space.faces == {"x": (0.0, 40.0)} and state.select([0]).space == state.space
+    assert without.bind(state=state).step(state).space is None
+
+
+def test_measures_see_neighbours_across_faces():
+    scene = tf.Scene(tf.Mechanics(dim=2, periodic={"x": (0, 40)}))
+    cells = tf.Cells(
+        position=[[0.4, 5.0], [39.7, 5.0], [20.0, 5.0]], axis=[[0.0, 1.0]] * 3, length=2.0,
+        cell_type=[1, 1, 0],
+    )  # fmt: skip
+    state = scene.bind(cells=cells).start()
+    i, j, apart = tf.measure.neighbours(state, 0.2)
+    assert sorted([int(i), int(j)]) == [0, 1] and float(apart) == pytest.approx(0.7)
+    assert tf.measure.clusters(state, 0.2).tolist() == [0, 0, 1]
+    assert float(tf.measure.overlaps(state).worst) == pytest.approx(0.3)
+    assert float(tf.measure.alike_neighbours(state, 0.2)) == 1.0

@@ -428,3 +428,24 @@ def test_it_is_explained():
     scene = stuck(pair(0.1, extra={"a": [1.0, 1.0]}), tf.Adhesion(80.0, adhesin="a"))
     text = str(tf.explain(scene))
     assert "adhesion: a pull of up to 80 μ·µm²/h at a gap of 0.1 µm, in proportion to a" in text
+
+
+@pytest.mark.parametrize("backend", ("compiled", "torch"))
+@pytest.mark.parametrize(("dim", "along"), [(2, "y"), (3, "y"), (3, "z")])
+def test_cells_stick_together_across_the_faces_of_every_axis(backend, dim, along):
+    """Two cells, one at either face, 0.1 µm apart, are held as two in the middle are."""
+    glue, found, k = tf.Adhesion(strength=300.0, reach=0.3), [], "xyz".index(along)
+    for shift in (0.0, 10.0):
+        position = np.full((2, dim), 5.0)
+        position[:, k] = np.array([19.45 + shift, 0.55 + shift]) % 20.0
+        cells = tf.Cells(position=position, axis=[np.eye(dim)[0]] * 2, length=2.0)
+        scene = tf.Scene(
+            tf.Mechanics(dim=dim, adhesion=[glue], periodic={along: (0, 20)}, backend=backend),
+            dt=0.02,
+        )
+        model = scene.bind(cells=cells, dtype=torch.float64)
+        state = model.start()
+        for _ in range(5):
+            state = model.step(state)
+        found.append(float(tf.measure.neighbours(state, 0.3)[2]))
+    assert found[0] == pytest.approx(found[1], abs=1e-9) and 0.98 < found[0] < 1.05

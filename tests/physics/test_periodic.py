@@ -464,28 +464,6 @@ def test_signals_and_cells_have_the_same_faces():
         tf.Scene(cells, medium((-20.0, 20.0), periodic=True))
 
 
-def test_a_state_of_another_scene_has_the_space_of_the_model_that_steps_it():
-    with_faces = tf.Scene(tf.Mechanics(dim=2, periodic={"x": (0, 40)}))
-    without = tf.Scene(tf.Mechanics(dim=2))
-    state = with_faces.bind().start()
-    assert state.space.faces == {"x": (0.0, 40.0)} and state.select([0]).space == state.space
-    assert without.bind(state=state).step(state).space is None
-
-
-def test_measures_see_neighbours_across_faces():
-    scene = tf.Scene(tf.Mechanics(dim=2, periodic={"x": (0, 40)}))
-    cells = tf.Cells(
-        position=[[0.4, 5.0], [39.7, 5.0], [20.0, 5.0]], axis=[[0.0, 1.0]] * 3, length=2.0,
-        cell_type=[1, 1, 0],
-    )  # fmt: skip
-    state = scene.bind(cells=cells).start()
-    i, j, apart = tf.measure.neighbours(state, 0.2)
-    assert sorted([int(i), int(j)]) == [0, 1] and float(apart) == pytest.approx(0.7)
-    assert tf.measure.clusters(state, 0.2).tolist() == [0, 0, 1]
-    assert float(tf.measure.overlaps(state).worst) == pytest.approx(0.3)
-    assert float(tf.measure.alike_neighbours(state, 0.2)) == 1.0
-
-
 @pytest.mark.parametrize("dim, axes", AXES)
 @pytest.mark.parametrize("count", (30, 200))
 def test_near_pairs_of_some_cells_are_found_across_faces(dim, axes, count):
@@ -501,24 +479,3 @@ def test_near_pairs_of_some_cells_are_found_across_faces(dim, axes, count):
         wanted = every[(some[every] > 0).any(1)]
         assert sorted(map(tuple, found.tolist())) == sorted(map(tuple, wanted.tolist()))
         assert count < 200 or 0 < len(wanted) < len(every)
-
-
-@pytest.mark.parametrize("backend", ("compiled", "torch"))
-@pytest.mark.parametrize(("dim", "along"), [(2, "y"), (3, "y"), (3, "z")])
-def test_cells_stick_together_across_the_faces_of_every_axis(backend, dim, along):
-    """Two cells, one at either face, 0.1 µm apart, are held as two in the middle are."""
-    glue, found, k = tf.Adhesion(strength=300.0, reach=0.3), [], "xyz".index(along)
-    for shift in (0.0, 10.0):
-        position = np.full((2, dim), 5.0)
-        position[:, k] = np.array([19.45 + shift, 0.55 + shift]) % 20.0
-        cells = tf.Cells(position=position, axis=[np.eye(dim)[0]] * 2, length=2.0)
-        scene = tf.Scene(
-            tf.Mechanics(dim=dim, adhesion=[glue], periodic={along: (0, 20)}, backend=backend),
-            dt=0.02,
-        )
-        model = scene.bind(cells=cells, dtype=torch.float64)
-        state = model.start()
-        for _ in range(5):
-            state = model.step(state)
-        found.append(float(tf.measure.neighbours(state, 0.3)[2]))
-    assert found[0] == pytest.approx(found[1], abs=1e-9) and 0.98 < found[0] < 1.05
