@@ -32,13 +32,18 @@ class Calibration:
     def coverage(self, level: float = 0.9) -> dict[str, float]:
         """The share of truths in the central interval of each parameter, and in the joint region
         of highest density ("all together"); `level` where the posteriors are right."""
-        # the middle of the share of samples that a rank stands for
-        place = (self.ranks + 0.5) / (self.samples + 1)
-        inside = np.abs(place - 0.5) <= 0.5 * level
-        joint = (self.density_ranks + 0.5) / (self.samples + 1) <= level
+        inside = self._covered(self.ranks, 0.5 - 0.5 * level, 0.5 + 0.5 * level)
+        joint = self._covered(self.density_ranks, 0.0, level)
         return {n: float(v) for n, v in zip(self.names, inside.mean(0), strict=True)} | {
             ALL: float(joint.mean())
         }
+
+    def _covered(self, ranks: np.ndarray, low: float, high: float) -> np.ndarray:
+        """What part of the shares of samples that each rank stands for lies between two shares:
+        that of all ranks is high − low, whatever the number of samples."""
+        count = self.samples + 1
+        part = np.minimum(ranks + 1, high * count) - np.maximum(ranks, low * count)
+        return np.asarray(np.clip(part, 0.0, 1.0))
 
     def table(self, level: float = 0.9) -> str:
         """The coverage in per cent, with its standard error where the posteriors are right."""

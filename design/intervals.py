@@ -17,7 +17,7 @@ from design.targets.observed_conditions import data_of, standard_errors
 from torchfilm import checks
 
 UNTOLD = 1e-12  # of the greatest information along a direction; with less nothing is told of it
-TOGETHER = 0.9  # a correlation from which tables say that two parameters are not told apart
+TOGETHER = 0.9  # a correlation from which tables say that two parameters are told together
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -64,7 +64,7 @@ class Intervals:
         return found
 
     def table(self, level: float = 0.9) -> str:
-        """Each parameter with its interval, what is not told apart, and whether the loss is that of
+        """Each parameter with its interval, what is told together, and whether the loss is that of
         a right model."""
         rows = [("parameter", "best", f"{100 * level:g} % interval")]
         for (name, (low, high)), parameter, value in zip(
@@ -78,7 +78,7 @@ class Intervals:
         lines = [f"{a:<{width[0]}}  {b:>{width[1]}}  {c}" for a, b, c in rows]
         related = self.correlation
         pairs = combinations(enumerate(p.name for p in self.parameters), 2)
-        lines += not_told_apart({(one, other): related[i, j] for (i, one), (j, other) in pairs})
+        lines += told_together({(one, other): related[i, j] for (i, one), (j, other) in pairs})
         expected = max(self.readings - len(self.parameters), 0) / self.readings
         freedom = max(self.readings - len(self.parameters), 1)
         far = self.loss > expected + 3 * math.sqrt(2 * freedom) / self.readings
@@ -101,10 +101,11 @@ class Intervals:
         return tf.displays.card("Intervals", tf.displays.text(self.table()))
 
 
-def not_told_apart(correlations: Mapping[tuple[str, str], float]) -> list[str]:
-    """What to know of two parameters that the data tell together."""
+def told_together(correlations: Mapping[tuple[str, str], float]) -> list[str]:
+    """What to know of two parameters of which the data tell a combination."""
     return [
-        f"{one} and {other} are not told apart: their correlation is {r:.2f}"
+        f"{one} and {other} are told together: their correlation is {r:.2f}, so that a combination"
+        " of them is known better than each"
         for (one, other), r in correlations.items()
         if abs(r) >= TOGETHER
     ]

@@ -10,7 +10,7 @@ import numpy as np
 
 import torchfilm as tf
 from design.calibration import Calibration
-from design.intervals import not_told_apart
+from design.intervals import told_together
 from design.neural_posterior import NeuralPosterior
 from design.parameters import Parameter, Value, show_value
 from design.posterior_plot import draw_corner
@@ -189,7 +189,7 @@ class Posterior:
         if len(failures) > 3:
             lines.append(f"{sum(n for _, n in failures[3:])} simulations failed for other reasons")
         lines += extinct_words(self.observed, [why for why, _ in failures])
-        lines += not_told_apart(self.correlations)
+        lines += told_together(self.correlations)
         if self.other_sizes:
             lines.append(self.other_sizes)
         if self.surprises:

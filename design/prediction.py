@@ -70,9 +70,8 @@ class Prediction:
     def table(self, level: float = 0.9) -> str:
         """Each statistic as observed and as predicted, those outside marked."""
         width = max(26, *(len(n) for n in self.observed.plan.names))
-        lines = [
-            f"{'':<{width}} {'observed':>19}  {100 * level:g} % of {len(self.statistics)} predicted"
-        ]
+        share = f"{100 * level:g} % of {len(self.statistics)} predicted"
+        lines = [f"{'':<{width}} {'observed ± sd':>19}  {share}"]
         outside = 0
         rows = zip(
             self.interval(level).items(), self.observed.values, self.observed.spread, strict=True

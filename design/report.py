@@ -213,7 +213,7 @@ def _warnings(report: SearchReport) -> list[str]:
             "the first guess has a smaller loss on the seeds of the search. If the search did not"
             " grow it to full size, begin another one with it: start=."
         )
-    if lucky := _lucky(report):
+    if lucky := _lucky(report) or _untested(report):
         lines.append(lucky)
     bound = [p.name for p in space.parameters if at_bound(p, best.values[p.name])]
     if bound:
@@ -253,6 +253,18 @@ def _lucky(report: SearchReport) -> str:
         f"the {report.task.replicates} seeds of the search were lucky: {here:.4f} there,"
         f" {there:.4f} on fresh ones. Such losses mislead a search; give it more replicates."
     )
+
+
+def _untested(report: SearchReport) -> str:
+    """That the loss is the lowest of several that differ by chance; else ""."""
+    full = report.study.full()
+    several = sum(len(e.losses) for e in full) > 1
+    chance = any(
+        (np.ptp(e.losses, axis=1) > DIFFERENT * np.abs(e.losses).max()).any() for e in full
+    )
+    if report.best.fresh is not None or not (several and chance):
+        return ""
+    return "not tested on fresh seeds: the loss is the lowest of several, low partly by luck."
 
 
 def best_trivial(target: Target, answers: Mapping[str, float]) -> str:
@@ -330,8 +342,9 @@ def _misses(target: Target, best: ReportedDesign) -> str:
         " are above 1 also where the mean fits; give the numbers of each colony"
         " (Measured.of_colonies, or values by time and colony). "
         if has_mean_with_error(target)
-        else "colonies that grew as the observed ones did have a loss of about 1 (up to 5 where one"
-        " or two were observed, which do not tell how much colonies differ). "
+        else "colonies that grew as the observed ones did have a loss of about 1 where many were"
+        " observed (of n some (n − 1)/(n − 3): 2 of five, 4 or more of one or two, which do not"
+        " tell how much colonies differ). "
     )
     return (
         f"{like if target.evidence else ''}The best design is off most in {words}. Search longer,"
@@ -365,7 +378,7 @@ def _mean(values: list[float]) -> float:
 def _spread(values: list[float]) -> str:
     """The standard deviation of a measure between colonies, and how many have it."""
     some = np.array([x for x in values if np.isfinite(x)])
-    spread = f"± {float(some.std(ddof=1)):.2g}" if len(some) > 1 else ""
+    spread = f"sd {float(some.std(ddof=1)):.2g}" if len(some) > 1 else ""
     missing = sum(np.isnan(x) for x in values)
     return spread + (f" (undefined in {missing} of {len(values)})" if missing else "")
 

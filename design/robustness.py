@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 import torchfilm as tf
 from design.parameters import Value, show_value
@@ -85,7 +86,8 @@ class Robustness:
 
     @property
     def high(self) -> float:
-        """The 0.9 quantile of the loss: nine of ten seeds do not exceed it."""
+        """The 0.9 quantile of the losses on these seeds. Somewhat less than nine of ten new seeds
+        do not exceed it: some 82 % where 8 were grown, 88 % where 32 were."""
         return float(np.quantile(self.losses, 0.9))
 
     @property
@@ -107,8 +109,9 @@ class Robustness:
             f" {first} … {last}; failed: {self.failed:.0%}"
         ]
         if self.threshold is not None:
-            lines.append(f"loss at most {self.threshold:g}: {self.reached:.0%} of them")
-        rows: list[tuple[str, ...]] = [("", "cells", "hours", "mean", "median", "90 %")]
+            lines.append(f"loss at most {self.threshold:g}: {self._reached_words()}")
+        head = ("", "cells", "hours", "mean", "± error", "median", "0.9 quantile")
+        rows: list[tuple[str, ...]] = [head]
         rows += [
             ("searched", "", "", *_summary(self.searched)),
             ("fresh", "", "", *_summary(self.losses)),
@@ -118,12 +121,17 @@ class Robustness:
             for s in self.sizes
         ]
         if self.varied is not None:
-            name = f"all parameters ± {self.varied.vary:.0%}"
+            name = f"all parameters × exp({self.varied.vary:g} z)"
             rows.append((name, "", "", *_summary(self.varied.losses)))
         lines += displays.aligned(rows, left=(0,))
-        if self.varied is not None and self.varied.clipped > 0:
+        if self.varied is not None:
+            change, error = self.varied.change(self.losses)
+            known = "" if math.isnan(error) else f" ± {error:.4f}"
             lines.append(
-                f"of varied parameters {self.varied.clipped:.0%} were held by their bounds"
+                f"all parameters at once (z: normal numbers) change the loss by {change:+.4f}"
+                f"{known} on the same seeds"
+                + f"; bounds held {self.varied.clipped:.0%} of them"
+                * (self.varied.clipped > 0)
             )
         lines += ["", *displays.aligned(self._change_rows(), left=(0,))]
         if self.indices is not None:
@@ -134,6 +142,15 @@ class Robustness:
                 *displays.aligned(self._index_rows(self.indices), left=(0,)),
             ]
         return tf.displays.Text("\n".join(lines))
+
+    def _reached_words(self) -> str:
+        """The share of seeds that reach the threshold, with its interval (Wilson)."""
+        count, good = len(self.losses), int((self.losses <= self.threshold).sum())
+        interval = binomtest(good, count).proportion_ci(0.9, method="wilson")
+        return (
+            f"{good / count:.0%} of them (90 % interval of the share {interval.low:.0%} to"
+            f" {interval.high:.0%})"
+        )
 
     def _change_rows(self) -> list[tuple[str, ...]]:
         head = ("parameter", "value", "changed to", "requested", "loss change", "± error")
@@ -195,7 +212,10 @@ class Robustness:
 
 
 def _summary(losses: np.ndarray) -> tuple[str, ...]:
-    return tuple(f"{x:.4f}" for x in (losses.mean(), np.median(losses), np.quantile(losses, 0.9)))
+    count = len(losses)
+    error = f"{losses.std(ddof=1) / math.sqrt(count):.4f}" if count > 1 else ""
+    mean, median, high = losses.mean(), np.median(losses), np.quantile(losses, 0.9)
+    return f"{mean:.4f}", error, f"{median:.4f}", f"{high:.4f}"
 
 
 def _or_blank(number: float | None) -> str:

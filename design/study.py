@@ -132,7 +132,7 @@ class Study:
             for k in range(len(e.loss))
         ]
         rows.sort(key=lambda row: row[0])
-        text = [["loss", "±", "cells", *self.names]]
+        text = [["loss", "sd", "cells", *self.names]]
         for loss, losses, cells, values in rows[: max(most, 0)]:
             spread = f"{losses.std(ddof=1):.2g}" if len(losses) > 1 else ""
             shown = [show_value(values[name]) for name in self.names]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -18,12 +19,22 @@ STREAMS = 4  # of random numbers on which variants are grown, in turn
 @dataclass(frozen=True, eq=False)
 class Varied:
     """Variants of a design. vary: the standard deviation of the logarithm of a parameter; points:
-    (M, D), of the variants; clipped: share of the values that bounds held; losses: (M,)."""
+    (M, D), of the variants; clipped: share of the values that bounds held; losses: (M,); streams:
+    (M,), on which of the streams of the check each was grown."""
 
     vary: float
     points: np.ndarray
     clipped: float
     losses: np.ndarray
+    streams: np.ndarray
+
+    def change(self, losses: np.ndarray) -> tuple[float, float]:
+        """By how much the loss of a variant exceeds that of the design on the same stream, and the
+        standard error. losses: (S,), of the design, on each stream."""
+        gained = self.losses - losses[self.streams]
+        count = len(gained)
+        error = float(gained.std(ddof=1)) / math.sqrt(count) if count > 1 else math.nan
+        return float(gained.mean()), error
 
 
 def varied(
@@ -39,12 +50,13 @@ def varied(
     points, clipped = _variants(objective.task.space.parameters, point, vary, len(streams))
     losses = np.full(len(points), np.nan)
     parts = min(STREAMS, len(streams))
+    used = np.arange(len(points)) % parts
     for k in range(parts):
         found = objective.evaluate(
             points[k::parts], streams=(streams[k],), executor=executor, work_items=work_items
         )
         losses[k::parts] = found.losses[:, 0]
-    return Varied(vary, points, clipped, losses)
+    return Varied(vary, points, clipped, losses, used)
 
 
 def _variants(

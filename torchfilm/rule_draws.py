@@ -72,7 +72,7 @@ class Draws:
         """How many of a `number` come out right, each with this probability: one draw for each
         cell, (N,), or each division, (M,). Plasmids, say, that go to the first daughter:
         k = parent.binomial(parent.plasmids, 0.5)."""
-        drawn = self.random()
+        drawn = self._fine()
         given = _column("binomial", number, drawn)
         # of molecules: a concentration times a volume
         count, off = nearest(given, self._state.dtype)

@@ -292,7 +292,7 @@ def _deviations(*columns: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
 
 
 def _variation(values: np.ndarray) -> np.ndarray:
-    """The coefficient of variation."""
+    """The coefficient of variation of a sample (divided by its number less one)."""
     (apart,), count = _deviations(values)
     mean = _average(values)
     return np.sqrt((apart * apart).sum(-1) / (count - 1.0)) / np.where(mean == 0.0, np.nan, mean)

@@ -131,8 +131,9 @@ class Measured(Target):
 
         values: by name, as many numbers as colonies, three at least. Wanted is their mean, and the
         spread is their standard deviation, at least 1 % of the greatest number, so that a colony
-        like them has a loss of about 1. error: of measurement, of the mean; by default 0, as of
-        counts. The rest is as of `Measured`. Raises InputError for other names and numbers.
+        like them has a loss of about 1, of n some (1 + 1/n)(n − 1)/(n − 3): 2.4 of five. error: of
+        measurement, of the mean; by default 0, as of counts. The rest is as of `Measured`. Raises
+        InputError for other names and numbers.
         """
         rows = {}
         if not isinstance(functions, Mapping) or not functions:

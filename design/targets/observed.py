@@ -51,8 +51,9 @@ class Observed(Target):
     seen from above, in the x–y plane.
 
     Loss: the mean over the statistics of ((statistic − value)/spread)². It is about 1 for a colony
-    that grew as the observed ones did. Beyond 100 spreads a square grows linearly (Huber), so that
-    data which are far off still tell a search where to go.
+    that grew as the observed ones did, where many were observed, and some (n − 1)/(n − 3) of n.
+    Beyond 100 spreads a square grows linearly (Huber), so that data which are far off still tell a
+    search where to go.
 
     spread is bootstrapped: the cells of each colony are drawn 200 times with replacement; the
     number of cells has 1/√N, as if divisions were independent. This leaves out what all cells of a

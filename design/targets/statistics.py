@@ -355,8 +355,8 @@ def _scatter(level: Tensor, mean: Tensor, cells: SeenCells) -> tuple[Tensor, Ten
 
 
 def _variation(level: Tensor, mean: Tensor, cells: SeenCells) -> Tensor:
-    """The standard deviation between the cells of a colony over their mean, (B, 1); 0 where all
-    cells are alike."""
+    """The standard deviation between the cells of a colony (of all of them: divided by their
+    number) over their mean, (B, 1); 0 where all cells are alike."""
     _, variance, varied = _scatter(level, mean, cells)
     square = torch.where(varied, variance / torch.where(varied, mean.square(), 1.0), 1.0)
     return torch.where(varied, square.sqrt(), 0.0)

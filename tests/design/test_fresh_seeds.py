@@ -11,7 +11,8 @@ from searching import Level, lit, mean
 
 from design import NSGA2, Burden, Finals, Parameter, Search, Sobol, Study, Target
 from design.entries import Entry
-from design.finals import FIRST_STREAM, SOUND_STREAM, is_certain
+from design.finals import FIRST_STREAM, SOUND_STREAM, FreshLosses, is_certain
+from design.report import fresh_words
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 
@@ -54,6 +55,36 @@ def test_the_seeds_of_an_only_finalist_have_chosen_nothing():
     best = made.run(60, progress=False)
     assert {e.streams[0] for e in made.study.finals} == {FIRST_STREAM}
     assert not best.fresh.chosen and "which chose it" not in best.table()
+
+
+@dataclasses.dataclass(frozen=True)
+class Uneven(Target):
+    """The distance of the mean level from 1, and more on every second seed."""
+
+    names = ("gfp",)
+    failed = 1.5
+
+    def loss(self, state, history=None):
+        return (mean(state, "gfp") - 1.0).abs() + 0.1 * (state.stream % 2)
+
+
+def test_a_loss_that_no_fresh_seed_has_tested_is_low_by_luck():
+    method = Sobol(batch=4)
+    uneven = Search(lit, LIT, Uneven(), method=method, cells=3, replicates=2, finals=None)
+    words = "not tested on fresh seeds: the loss is the lowest of several"
+    assert words in uneven.run(16, progress=False).table()
+    # one design is no choice, and alike seeds are no luck
+    assert words not in dataclasses.replace(uneven).run(2, progress=False).table()
+    alike = Search(lit, LIT, Level(), method=method, cells=3, replicates=2, finals=None)
+    assert words not in alike.run(16, progress=False).table()
+
+
+def test_the_table_counts_fresh_seeds_that_failed():
+    task = Search(lit, LIT, Uneven(), cells=3, replicates=2).objective.task
+    losses = np.array([0.1, 0.2, Uneven.failed, 0.3])
+    fresh = FreshLosses(losses, float(losses.mean()), (0.0, 1.0))
+    assert "4 seeds; 1 of them failed, and count 1.5000" in fresh_words(task, fresh)
+    assert "failed" not in fresh_words(task, FreshLosses(losses[:2], 0.15, (0.0, 1.0)))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -198,9 +198,10 @@ def test_calibration_counts_covered_truths(posterior, tmp_path):
     assert posterior.plot(tmp_path / "corner.png", truth={"rate": 1.4}).path.stat().st_size > 1000
 
 
-def test_coverage_of_even_ranks_is_the_level():
-    ranks = np.arange(100)
-    made = Calibration(("a",), ranks[:, None], ranks, 99, failed=2)
+@pytest.mark.parametrize("samples", [9, 12, 49, 99, 1000])
+def test_coverage_of_even_ranks_is_the_level(samples):
+    ranks = np.arange(samples + 1)
+    made = Calibration(("a",), ranks[:, None], ranks, samples, failed=2)
     assert made.coverage(0.9) == pytest.approx({"a": 0.9, "all together": 0.9})
     assert made.coverage(0.5) == pytest.approx({"a": 0.5, "all together": 0.5})
     assert "2 truths failed" in made.table()
@@ -443,9 +444,9 @@ def test_parameters_that_the_data_do_not_tell_apart_are_named(data):
     one = rng.uniform(0.2, 0.8, 50)
     tied = replace(found, points=np.c_[one, 1.0 - one + 0.01 * rng.normal(size=50)])
     assert tied.correlations["first", "second"] < -0.95
-    assert "first and second are not told apart: their correlation is -" in tied.table()
+    assert "first and second are told together: their correlation is -" in tied.table()
     loose = replace(found, points=rng.random((50, 2)))
-    assert "told apart" not in loose.table()
+    assert "told together" not in loose.table()
 
 
 def populated(mean=20.0, cells=60):

@@ -375,7 +375,11 @@ def test_all_parameters_vary_at_once_within_their_bounds(spare, tmp_path):
     assert varied.losses.shape == (40,) and varied.losses[0] == each[0, 0]
     again = check_robustness(spare, seeds=40, sizes=(), vary=0.3, progress=False)
     assert np.array_equal(again.varied.losses, varied.losses)
-    assert "all parameters ± 30%" in found.table()
+    assert "all parameters × exp(0.3 z)" in found.table()
+    gained = varied.losses - found.losses[np.arange(40) % 4]
+    assert varied.change(found.losses)[0] == pytest.approx(gained.mean())
+    assert varied.change(found.losses)[1] == pytest.approx(gained.std(ddof=1) / math.sqrt(40))
+    assert f"change the loss by {gained.mean():+.4f} ± " in found.table()
     saved = json.loads(found.save(tmp_path / "held.json").read_text())
     assert saved["varied"]["losses"] == varied.losses.tolist()
     found.plot(tmp_path / "held.png")
@@ -395,3 +399,12 @@ def test_choices_and_whole_numbers_do_not_vary():
     points, clipped = _variants(parameters, point, 10.0, 50)
     assert (points[:, :2] == point[:2]).all() and (points[:, 2] != point[2]).all()
     assert 0.5 < clipped < 1.0 and points[:, 2].min() >= 0.0 and points[:, 2].max() <= 1.0
+
+
+def test_shares_have_an_interval_and_means_an_error(spare):
+    found = check_robustness(spare, seeds=8, sizes=(), threshold=1e9, progress=False)
+    text = found.table()
+    assert "100% of them (90 % interval of the share 75% to 100%)" in text
+    row = next(line for line in text.splitlines() if line.startswith("fresh")).split()
+    error = found.losses.std(ddof=1) / math.sqrt(8)
+    assert [float(x) for x in row[1:3]] == pytest.approx([found.mean, error], abs=1e-4)

@@ -409,7 +409,7 @@ def test_a_table_lists_the_best_designs_first():
     made.run(40, progress=False)
     study = made.study
     lines = study.table(most=3).splitlines()
-    assert lines[0].split() == ["loss", "±", "cells", "make", "decay"]
+    assert lines[0].split() == ["loss", "sd", "cells", "make", "decay"]
     losses = sorted(x for e in study.full() for x in e.loss.tolist())
     assert [line.split()[0] for line in lines[1:4]] == [f"{x:.4f}" for x in losses[:3]]
     assert lines[4] == f"and {len(losses) - 3} more" and len(losses) > 3
@@ -418,7 +418,7 @@ def test_a_table_lists_the_best_designs_first():
     values = (f"{best.values[name]:.4g}" for name in ("make", "decay"))
     assert lines[1].split()[2:] == [f"{cells:.0f}", *values]
     assert len(study.table(most=1000).splitlines()) == len(losses) + 1
-    assert Study({}, ("make",), tuple(range(8))).table() == "loss  ±  cells  make"
+    assert Study({}, ("make",), tuple(range(8))).table() == "loss  sd  cells  make"
 
 
 def test_info_says_what_was_searched_and_found():

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
 import torch
 
 import torchfilm as tf
+from torchfilm.rule_draws import Draws
 
 ONE = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], cell_type=[0])
 EIGHT = tf.Cells(
@@ -143,6 +145,21 @@ def test_chance_and_binomial_follow_their_laws():
     assert float(count.mean()) == pytest.approx(5.0, abs=5 * (3.75 / 4000) ** 0.5)
     assert float(count.var()) == pytest.approx(3.75, rel=0.2)
     assert torch.equal(count, count.round()) and float(count.max()) <= 20
+
+
+@pytest.mark.parametrize("last, expected", [(2.0**-24, 1.0), (0.5, 0.0)])
+def test_rare_events_of_a_binomial_occur(monkeypatch, last, expected):
+    """One of 2·10⁷: 23 random bits end before it."""
+    draws = itertools.cycle([1 - 2.0**-24, 1 - last])  # the first bits of a number, and the last
+    each = lambda self: torch.full((self._state.cells,), next(draws), dtype=torch.float64)
+    monkeypatch.setattr(Draws, "random", each)
+
+    def draw(cells):
+        cells.mark = cells.binomial(1, 5e-8)
+
+    rules = tf.Rules(draw, variables={"mark": 0.0})
+    model = tf.Scene(rules, dim=2, founders=tf.Cells.single(2)).bind()
+    assert model.step(model.start(), 0.1).mark.tolist() == [expected]
 
 
 def test_normal_and_poisson_follow_their_laws():

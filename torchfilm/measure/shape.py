@@ -117,8 +117,8 @@ def below_top(
 
 @of_a_state
 def nematic_order(state: State) -> Tensor:
-    """Alignment of the axes of each colony in the x–y plane, (B,): 0 for random, 1 for parallel;
-    NaN without cells.
+    """Alignment of the axes of each colony in the x–y plane, (B,): 0 for many random ones, about
+    √(π/4n) for n, 1 for parallel; NaN without cells.
 
     In space it is that of their projections, weighted by cos² of the tilt: a cell that stands
     upright does not count, and where all do it is NaN. `tilt` says how far they stand up."""
