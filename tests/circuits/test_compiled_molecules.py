@@ -14,6 +14,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from scipy import stats
 from traced import alone, circuits, ends, equal, one_step, plain_module
 
 import torchfilm as tf
@@ -198,6 +199,18 @@ def test_a_poisson_number_is_that_of_torch(mean):
     )
     wanted = draws.poisson(torch.full_like(uniform, mean), uniform)
     assert [for_python(poisson)(mean, u) for u in uniform.tolist()] == wanted.tolist()
+
+
+@pytest.mark.parametrize("off", [-1e-9, 1e-9, -1e-7, 1e-7])
+@pytest.mark.parametrize("mean", [101.3, 777.7, 54321.0])
+def test_a_poisson_number_at_a_step_is_on_its_side(mean, off):
+    """Just below P(X ≤ k) it is k, and just above k + 1: guesses are too high or too low there."""
+    k = np.random.default_rng(0).poisson(mean, 300)
+    uniform = torch.from_numpy(stats.poisson.cdf(k, mean) * (1 + off))
+    expected = (k + (off > 0)).tolist()
+    assert [for_python(poisson)(mean, u) for u in uniform.tolist()] == expected
+    if abs(off) > 1e-9:  # which is the error of torch's incomplete gamma function
+        assert draws.poisson(torch.full_like(uniform, mean), uniform).tolist() == expected
 
 
 # --- independence of how the work is divided ------------------------------------------------------

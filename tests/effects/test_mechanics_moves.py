@@ -289,3 +289,14 @@ def test_cells_sink_into_soft_walls_as_deep_as_pressure_takes_them(backend):
         )
     assert worst <= 0.2
     assert backend == "torch" or deepest > 0.5, "some cell lies deeper than its radius in agarose"
+
+
+@pytest.mark.parametrize("backend", ("compiled", "torch"))
+def test_a_cell_deep_in_a_hard_wall_comes_out_in_one_step(backend):
+    """A pass moves it by 0.3 µm at most; no pair of cells asks for another pass, the wall does."""
+    cells = tf.Cells([[0.0, 0.02], [30.0, 3.0]], [X, X], length=2.0)
+    walls = [tf.Plane(y=0.0, facing="+y")]
+    scene = tf.Scene(tf.Mechanics(dim=2, walls=walls, backend=backend), founders=cells, dt=0.01)
+    model = scene.bind(dtype=torch.float64)
+    height = model.step(model.start()).position[:, 1].tolist()
+    assert 0.49 < height[0] <= 0.5 and height[1] == 3.0
