@@ -195,7 +195,7 @@ class Robustness:
         sizes = [(f"× {s.share:g}", s.losses) for s in self.sizes]
         columns = [("searched", self.searched), ("fresh", self.losses), *sizes]
         if self.varied is not None:
-            columns.append((f"all ± {self.varied.vary:.0%}", self.varied.losses))
+            columns.append(("all varied", self.varied.losses))
         draw_losses(axes[0], columns, self.threshold)
         draw_changes(
             axes[1],
