@@ -16,10 +16,9 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy.stats import binom
-from scipy.stats import t as student
 
 from design.entries import Entry
+from design.loss_bands import HOLDS, LEAST, is_mean, loss_band, seeds_to_hold
 from design.objective import Objective
 from design.parameters import Choice
 from design.pareto import nondominated, spread
@@ -28,19 +27,16 @@ from design.task import Task
 from torchfilm import checks
 
 FIRST_STREAM = 1_000_000  # beyond the streams of searches and robustness checks
+HOLD_STREAM = 1_500_000  # of the test of a wanted loss
 CHECK_STREAM = 2_000_000  # of the check of the winner
 SOUND_STREAM = 3_000_000  # of what shows whether seeds matter
-STAGES = SOUND_STREAM, CHECK_STREAM, FIRST_STREAM
+STAGES = SOUND_STREAM, CHECK_STREAM, HOLD_STREAM, FIRST_STREAM
 CHECK = 1 / 3  # of the colonies of finals with several designs
 MOST_SHARE = 0.9  # of a budget
-LEAST = 4  # fresh seeds of a finalist
 ALIKE = 0.02  # designs that are nearer in every coordinate count as one
 SOUNDED = 2  # designs, and fresh seeds of each, that show whether seeds matter
 ALIKE_LOSSES = 1e-9  # losses that differ by less, relative to the greater, are one
-HOLDS = (8, 24)  # fresh seeds of a design that may hold the wanted loss: first, then in all
 TESTED = 3  # designs of a batch that may hold it
-BAND = 0.9  # probability of a band
-RESAMPLES = 2000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +88,12 @@ class Finals(metaclass=checks.KnownKeywords):
         """Designs, each on one seed at all sizes, that the share of a budget allows."""
         return self.share * budget / sum(self.sizes)
 
+    def can_hold(self, task: Task, budget: float) -> bool:
+        """Whether the seeds on which a design may hold a loss fit: those that a quantile takes
+        beyond the usual ones come from the share of the budget."""
+        seeds = seeds_to_hold(task)[-1]
+        return seeds <= HOLDS[-1] or seeds <= self._rows(budget)
+
     def colonies(self, budget: float, certain: bool = False) -> float:
         """Colonies of the finals of a search of `budget` colonies. certain: seeds make no
         difference."""
@@ -118,10 +120,18 @@ class FreshLosses:
 def fresh_losses(
     task: Task, study: Study, sizes: Sequence[float], point: np.ndarray
 ) -> FreshLosses | None:
-    """Of a design (D,), those of the check where it was checked; None before it was grown on LEAST
-    seeds at all sizes."""
+    """Of a design (D,), those of the check where it was checked, else those of the finals or of the
+    test of a wanted loss; None before it was grown on LEAST seeds at all sizes."""
     checked = _fresh(task, study, sizes, point, CHECK_STREAM)
-    return checked or _fresh(task, study, sizes, point, FIRST_STREAM)
+    return checked or _choosing(task, study, sizes, point)
+
+
+def _choosing(
+    task: Task, study: Study, sizes: Sequence[float], point: np.ndarray
+) -> FreshLosses | None:
+    """Of the seeds that choose among designs."""
+    finals = _fresh(task, study, sizes, point, FIRST_STREAM)
+    return finals or _fresh(task, study, sizes, point, HOLD_STREAM)
 
 
 def _fresh(
@@ -131,16 +141,11 @@ def _fresh(
     losses = worst_of_sizes([_tested(study, point, size, first=first) for size in sizes])
     if len(losses) < LEAST:
         return None
-    rivals = {p.tobytes() for p in _known(study)}
-    chosen = first == FIRST_STREAM and (len(rivals) > 1 or _was_to_hold(study, point))
-    return FreshLosses(losses, float(task.reduced(losses[None])[0]), _band(task, losses), chosen)
-
-
-def _was_to_hold(study: Study, point: np.ndarray) -> bool:
-    """Whether a few seeds decided that a design (D,) was grown on more: a batch begins after
-    them."""
-    begin = FIRST_STREAM + HOLDS[0]
-    return any(e.streams[0] == begin and (e.points == point).all(1).any() for e in study.finals)
+    rivals = {p.tobytes() for e in study.finals if _stage(e) == FIRST_STREAM for p in e.points}
+    chosen = first == HOLD_STREAM or (first == FIRST_STREAM and len(rivals) > 1)
+    return FreshLosses(
+        losses, float(task.reduced(losses[None])[0]), loss_band(task, losses), chosen
+    )
 
 
 def fresh_goals(
@@ -205,56 +210,17 @@ def is_certain(task: Task, study: Study) -> bool:
     return alike and len({float(x[0]) for x in sound(sounded)}) >= SOUNDED
 
 
-def _is_mean(task: Task) -> bool:
-    """Whether the loss of a design is the mean of those of its colonies."""
-    return task.reduce == "mean" and not _reduces_itself(task)
-
-
-def seeds_of_an_end(task: Task) -> int:
-    """Seeds from which on the band of a quantile has an upper end; 1 where it always has one."""
-    if not _is_quantile(task):
-        return 1
-    return math.ceil(math.log(0.5 - BAND / 2) / math.log(float(task.reduce)))
-
-
-def _is_quantile(task: Task) -> bool:
-    """Whether the loss of a design is a quantile of those of its colonies, not of the worst."""
-    return isinstance(task.reduce, float) and task.reduce < 1 and not _reduces_itself(task)
-
-
-def _reduces_itself(task: Task) -> bool:
-    """Whether the target, such as a spread, makes one loss of those of the seeds."""
-    return task.target.reduced(np.zeros((1, LEAST))) is not None
-
-
-def _band(task: Task, losses: np.ndarray) -> tuple[float, float]:
-    """Student's interval of a mean; the order statistics that enclose a quantile whatever the
-    distribution (David and Nagaraja, Order Statistics, 2003, 7.1), infinite where the seeds are too
-    few; else the interval of resampled losses."""
-    if _is_mean(task):
-        error = losses.std(ddof=1) / np.sqrt(len(losses))
-        wide = float(student.ppf(0.5 + BAND / 2, len(losses) - 1) * error)
-        return float(losses.mean()) - wide, float(losses.mean()) + wide
-    if _is_quantile(task):
-        found = binom.ppf([0.5 - BAND / 2, 0.5 + BAND / 2], len(losses), task.reduce)
-        ends = np.concatenate([[-np.inf], np.sort(losses), [np.inf]])
-        return float(ends[int(found[0])]), float(ends[int(found[1]) + 1])
-    drawn = np.random.default_rng(0).choice(losses, (RESAMPLES, len(losses)))
-    low, high = np.quantile(task.reduced(drawn), [0.5 - BAND / 2, 0.5 + BAND / 2])
-    return float(low), float(high)
-
-
 def winner(task: Task, study: Study, sizes: Sequence[float]) -> np.ndarray | None:
     """The point (D,) of the design whose band ends lowest: few seeds make a wide band of a mean.
     But few seeds make a low quantile. So elsewhere a design must also be as good as those with
     fewer seeds on the seeds of these. None before a design was grown on fresh seeds."""
-    found = ((_fresh(task, study, sizes, p, FIRST_STREAM), p) for p in _known(study))
+    found = ((_choosing(task, study, sizes, p), p) for p in _known(study))
     known = [(fresh, p) for fresh, p in found if fresh is not None]
     # where every colony fails, a narrow band says nothing; few seeds set no end to a quantile
     ends = lambda x: (
         bool((x[0].losses == task.target.failed).all()), x[0].band[1], x[0].loss,
     )  # fmt: skip
-    if not known or _is_mean(task):
+    if not known or is_mean(task):
         return min(known, key=ends)[1] if known else None
     out: tuple[FreshLosses, np.ndarray] | None = None
     for seeds in sorted({len(fresh.losses) for fresh, _ in known}):
@@ -316,6 +282,8 @@ class FinalsRun:
     def holds(self, wanted: float) -> bool:
         """Whether one of the best designs, of all and of the last batch, holds a loss on fresh
         seeds: its band ends there. A few seeds decide whether it is tested on more."""
+        if not self.finals.can_hold(self.task, self.budget):
+            return False
         full, last = self.study.full(), self.study.entries[-1:]
         points: dict[bytes, np.ndarray] = {}
         for entries in (full, [e for e in full if e is last[0]]):
@@ -325,13 +293,14 @@ class FinalsRun:
         return any(self._holds(point, wanted) for point in points.values())
 
     def _holds(self, point: np.ndarray, wanted: float) -> bool:
-        for seeds in (HOLDS[0], max(HOLDS[1], seeds_of_an_end(self.task))):
-            if time.monotonic() >= self.deadline:
+        known, end = (self.task, self.study, self.finals.sizes, point, HOLD_STREAM), math.inf
+        for seeds in seeds_to_hold(self.task):
+            if time.monotonic() >= self.deadline or not self._grow([point], seeds, HOLD_STREAM):
                 return False
-            if not self._grow([point], seeds) or self._loss(seeds, point) > wanted:
+            if (found := _fresh(*known)) is None or found.loss > wanted:
                 return False
-        found = _fresh(self.task, self.study, self.finals.sizes, point, FIRST_STREAM)
-        return found is not None and found.band[1] <= wanted
+            end = found.band[1]
+        return end <= wanted
 
     def _front(self) -> None:
         """Grow designs from all parts of the front, as many as LEAST seeds of each allow."""

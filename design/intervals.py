@@ -104,8 +104,8 @@ class Intervals:
 def told_together(correlations: Mapping[tuple[str, str], float]) -> list[str]:
     """What to know of two parameters of which the data tell a combination."""
     return [
-        f"{one} and {other} are told together: their correlation is {r:.2f}, so that a combination"
-        " of them is known better than each"
+        f"{one} and {other} have a correlation of {r:.2f}: the data tell a combination of them"
+        " better than each"
         for (one, other), r in correlations.items()
         if abs(r) >= TOGETHER
     ]

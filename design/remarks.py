@@ -6,11 +6,13 @@ import sys
 
 import numpy as np
 
+from design.finals import Finals
+from design.loss_bands import seeds_to_hold
 from design.methods import Method
 from design.saved_design import why_unsaved
 from design.study import Study
 from design.task import Task
-from torchfilm import displays
+from torchfilm import checks, displays
 
 
 def all_failed(study: Study) -> bool:
@@ -28,6 +30,17 @@ def remark_on_begin(task: Task) -> None:
         )
     if why := why_unsaved(task.family.fixed):
         print(f"the best design can be run, but not saved: {why}", file=sys.stderr)
+
+
+def remark_on_stop_at(task: Task, finals: Finals | None, budget: float) -> None:
+    """Warn where no design can hold a wanted loss. budget: colonies under each condition."""
+    if finals is not None and not finals.can_hold(task, budget):
+        seeds = seeds_to_hold(task)[-1]
+        checks.warn(
+            f"stop_at: a design holds a loss of reduce={task.reduce:g} on {seeds} fresh seeds, more"
+            f" than the share of {budget:g} colonies that the finals have, so that the search does"
+            " not end early. Give more colonies or Finals(share=…), or a reduce nearer to 0.5."
+        )
 
 
 def remark_on_batch(task: Task, study: Study, size: float, loss: np.ndarray) -> None:

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from design.finals import FreshLosses, seeds_of_an_end
+from design.finals import FreshLosses
 from design.growing import FinishedColonies
+from design.loss_bands import seeds_of_an_end
 from design.parameters import Choice, Parameter, Space, Value, show_value
 from design.study import Study
 from design.targets.base import Target, inner_targets
@@ -157,7 +158,7 @@ def _seeds(task: Task, fresh: FreshLosses) -> str:
     low, high = fresh.band
     by = ", which chose it" if fresh.chosen else ""
     if failed.any():
-        by += f"; {failed.sum()} of them failed, and count {show_loss(task.target.failed)}"
+        by += f"; {failed.sum()} of them failed, each counts {show_loss(task.target.failed)}"
     if math.isinf(high):
         by += f"; an upper end takes {seeds_of_an_end(task)}"
     return f"{show_loss(low)} … {show_loss(high)}, {seeds} seeds{by}"
@@ -256,15 +257,19 @@ def _lucky(report: SearchReport) -> str:
 
 
 def _untested(report: SearchReport) -> str:
-    """That the loss is the lowest of several that differ by chance; else ""."""
+    """That the loss is the lowest of several that may differ by chance; else ""."""
     full = report.study.full()
     several = sum(len(e.losses) for e in full) > 1
     chance = any(
-        (np.ptp(e.losses, axis=1) > DIFFERENT * np.abs(e.losses).max()).any() for e in full
+        e.replicates == 1 or (np.ptp(e.losses, axis=1) > DIFFERENT * np.abs(e.losses).max()).any()
+        for e in full
     )
     if report.best.fresh is not None or not (several and chance):
         return ""
-    return "not tested on fresh seeds: the loss is the lowest of several, low partly by luck."
+    return (
+        "not tested on fresh seeds: where seeds matter, the lowest of several losses is low partly"
+        " by luck."
+    )
 
 
 def best_trivial(target: Target, answers: Mapping[str, float]) -> str:

@@ -129,7 +129,7 @@ class Robustness:
             known = "" if math.isnan(error) else f" ± {error:.4f}"
             lines.append(
                 f"all parameters at once (z: normal numbers) change the loss by {change:+.4f}"
-                f"{known} on the same seeds"
+                f"{known} on the same {len(np.unique(self.varied.streams))} seeds"
                 + f"; bounds held {self.varied.clipped:.0%} of them"
                 * (self.varied.clipped > 0)
             )

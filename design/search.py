@@ -29,6 +29,7 @@ from design.remarks import (
     remark_on_begin,
     remark_on_end,
     remark_on_stop,
+    remark_on_stop_at,
 )
 from design.study import Study
 from design.task import Task, TaskOptions
@@ -217,9 +218,9 @@ class Search(TaskOptions):
         if stop_at is not None:
             checks.number("stop_at", stop_at)
             if task.goals:
-                raise checks.input_error(
-                    "stop_at", stop_at, "None with several goals", "A front has no one loss."
-                )
+                rule = "None with several goals, since a front has no one loss"
+                raise checks.input_error("stop_at", stop_at, rule)
+            remark_on_stop_at(task, self.finals, colonies / count)
 
     def _search(
         self,

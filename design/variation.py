@@ -29,9 +29,11 @@ class Varied:
     streams: np.ndarray
 
     def change(self, losses: np.ndarray) -> tuple[float, float]:
-        """By how much the loss of a variant exceeds that of the design on the same stream, and the
-        standard error. losses: (S,), of the design, on each stream."""
-        gained = self.losses - losses[self.streams]
+        """By how much the loss of a variant exceeds that of the design on the same stream: the mean
+        over the streams, and its standard error; variants on one stream share that of the design.
+        losses: (S,), of the design, on each stream."""
+        each = np.unique(self.streams)
+        gained = np.array([(self.losses[self.streams == k] - losses[k]).mean() for k in each])
         count = len(gained)
         error = float(gained.std(ddof=1)) / math.sqrt(count) if count > 1 else math.nan
         return float(gained.mean()), error

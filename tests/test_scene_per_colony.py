@@ -185,6 +185,7 @@ def test_columns_of_texts_are_no_numbers():
         (np.array([1j, 2.0]), r"Growth\.rate is complex128 of shape \(2,\)"),
         (np.ones((2, 3)), r"is float64 of shape \(2, 3\): it must be one number, or a 1-D tensor"),
         ([True, False], r"Growth\.rate = \[True, False\] is not allowed"),
+        ([torch.tensor(True), 0.5], r"Growth\.rate = \[tensor\(True\), 0\.5\] is not allowed"),
         ([0.5, True], r"Growth\.rate = \[0\.5, True\] is not allowed"),
     ],
     ids=str,

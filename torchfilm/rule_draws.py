@@ -82,7 +82,7 @@ class Draws:
                 f"binomial was given the number {float(wrong[0])}: it must be whole, 0 or more"
             )
         each = self._noted("binomial", _probability("binomial", probability, drawn))
-        return binomial(self._noted("binomial", count), each, drawn)
+        return binomial(self._noted("binomial", count), each, drawn).to(self._state.dtype)
 
 
 class StepDraws(Draws):

@@ -15,16 +15,8 @@ from searching import lit, mean
 import torchfilm as tf
 from design import Finals, Measured, Parameter, Search, Sobol, Study, Target
 from design.entries import Entry
-from design.finals import (
-    CHECK_STREAM,
-    FIRST_STREAM,
-    HOLDS,
-    LEAST,
-    _band,
-    is_certain,
-    seeds_of_an_end,
-    winner,
-)
+from design.finals import CHECK_STREAM, FIRST_STREAM, is_certain, winner
+from design.loss_bands import HOLDS, LEAST, loss_band, seeds_of_an_end
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 
@@ -219,7 +211,7 @@ def test_a_band_by_which_a_design_was_chosen_is_told():
 def test_the_band_of_a_mean_is_that_of_student():
     losses = np.array([0.1, 0.4, 0.2, 0.7, 0.3])
     wanted = stats.t.interval(0.9, 4, losses.mean(), losses.std(ddof=1) / np.sqrt(5))
-    assert _band(search().objective.task, losses) == pytest.approx(wanted)
+    assert loss_band(search().objective.task, losses) == pytest.approx(wanted)
 
 
 @pytest.mark.parametrize("quantile", [0.25, 0.5, 0.75, 0.9])
@@ -227,7 +219,7 @@ def test_the_band_of_a_mean_is_that_of_student():
 def test_the_band_of_a_quantile_holds_for_skewed_losses(quantile, seeds):
     task, random = search(reduce=quantile).objective.task, np.random.default_rng(0)
     truth = stats.lognorm.ppf(quantile, 1.0)
-    bands = np.array([_band(task, random.lognormal(size=seeds)) for _ in range(1000)])
+    bands = np.array([loss_band(task, random.lognormal(size=seeds)) for _ in range(1000)])
     within = ((bands[:, 0] <= truth) & (truth <= bands[:, 1])).mean()
     assert within >= 0.9 - 3 * np.sqrt(0.9 * 0.1 / 1000)
     # each end is missed by at most one in twenty

@@ -71,7 +71,7 @@ class Uneven(Target):
 def test_a_loss_that_no_fresh_seed_has_tested_is_low_by_luck():
     method = Sobol(batch=4)
     uneven = Search(lit, LIT, Uneven(), method=method, cells=3, replicates=2, finals=None)
-    words = "not tested on fresh seeds: the loss is the lowest of several"
+    words = "not tested on fresh seeds: where seeds matter"
     assert words in uneven.run(16, progress=False).table()
     # one design is no choice, and alike seeds are no luck
     assert words not in dataclasses.replace(uneven).run(2, progress=False).table()
@@ -83,7 +83,7 @@ def test_the_table_counts_fresh_seeds_that_failed():
     task = Search(lit, LIT, Uneven(), cells=3, replicates=2).objective.task
     losses = np.array([0.1, 0.2, Uneven.failed, 0.3])
     fresh = FreshLosses(losses, float(losses.mean()), (0.0, 1.0))
-    assert "4 seeds; 1 of them failed, and count 1.5000" in fresh_words(task, fresh)
+    assert "4 seeds; 1 of them failed, each counts 1.5000" in fresh_words(task, fresh)
     assert "failed" not in fresh_words(task, FreshLosses(losses[:2], 0.15, (0.0, 1.0)))
 
 

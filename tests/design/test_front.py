@@ -378,7 +378,7 @@ def test_a_search_says_by_how_much_its_first_batch_misses_the_constraints(capsys
         (lambda: Search(lit, LIT, Level(), cells=3, method="nsga2"), r"NSGA2 needs targets=\[…\]"),
         (lambda: Search(lit, LIT, cells=3), r"target = None.*or targets=\[…\]"),
         (lambda: Search(lit, LIT, Level(), targets=GOALS, cells=3), "one of the two"),
-        (lambda: search().run(20, stop_at=0.1, progress=False), "A front has no one loss"),
+        (lambda: search().run(20, stop_at=0.1, progress=False), "a front has no one loss"),
         (lambda: Search(lit, LIT, Level(), cells=3, method=Sobol()).front(), r"targets=\[…\]"),
         (lambda: Weighted([]), "pairs of a target and its weight"),
         (lambda: Weighted([(Level(), -1.0)]), "weight of Level.*-1.0"),

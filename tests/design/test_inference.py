@@ -432,7 +432,7 @@ def test_a_file_of_other_statistics_is_refused(data, tmp_path):
 
 
 @needs_sbi
-def test_parameters_that_the_data_do_not_tell_apart_are_named(data):
+def test_parameters_of_which_the_data_tell_a_combination_are_named(data):
     def twice(first=1.0, second=1.0):
         return colony(rate=first * second)
 
@@ -444,9 +444,9 @@ def test_parameters_that_the_data_do_not_tell_apart_are_named(data):
     one = rng.uniform(0.2, 0.8, 50)
     tied = replace(found, points=np.c_[one, 1.0 - one + 0.01 * rng.normal(size=50)])
     assert tied.correlations["first", "second"] < -0.95
-    assert "first and second are told together: their correlation is -" in tied.table()
+    assert "first and second have a correlation of -" in tied.table()
     loose = replace(found, points=rng.random((50, 2)))
-    assert "told together" not in loose.table()
+    assert "have a correlation" not in loose.table()
 
 
 def populated(mean=20.0, cells=60):

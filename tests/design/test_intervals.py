@@ -99,7 +99,7 @@ def test_they_are_those_of_least_squares(conditions):
     )
     said = found.table(0.5)
     assert "50 % interval" in said and "of a right model with right spreads about 0.75" in said
-    assert "too narrow" not in said and "told together" not in said
+    assert "too narrow" not in said and "have a correlation" not in said
 
 
 def test_nine_of_ten_hold_the_truth():
@@ -154,10 +154,10 @@ def made(covariance, loss=1.0, readings=20, values=(1.0, 1.0)) -> Intervals:
 def test_what_a_table_says():
     """Of 20 readings and two parameters the loss is 0.9 ± 0.3."""
     related = made([[0.01, -0.0095], [-0.0095, 0.01]])
-    assert "a and b are told together: their correlation is -0.95" in related.table()
+    assert "a and b have a correlation of -0.95" in related.table()
     for loss, far in ((0.95, False), (1.75, False), (1.85, True)):
         said = made(np.diag([0.01, 0.01]), loss).table()
-        assert ("too narrow" in said) == far and "told together" not in said
+        assert ("too narrow" in said) == far and "have a correlation" not in said
     # 1 ± 0.6: below the lower bound, not above the upper one
     assert "beyond both" not in made(np.diag([0.13, 0.01])).table()
     assert "beyond both" in made(np.diag([0.5, 0.01])).table()

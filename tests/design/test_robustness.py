@@ -376,9 +376,10 @@ def test_all_parameters_vary_at_once_within_their_bounds(spare, tmp_path):
     again = check_robustness(spare, seeds=40, sizes=(), vary=0.3, progress=False)
     assert np.array_equal(again.varied.losses, varied.losses)
     assert "all parameters × exp(0.3 z)" in found.table()
-    gained = varied.losses - found.losses[np.arange(40) % 4]
+    # ten variants on each of four seeds share the loss of the design there
+    gained = (varied.losses - found.losses[np.arange(40) % 4]).reshape(10, 4).mean(0)
     assert varied.change(found.losses)[0] == pytest.approx(gained.mean())
-    assert varied.change(found.losses)[1] == pytest.approx(gained.std(ddof=1) / math.sqrt(40))
+    assert varied.change(found.losses)[1] == pytest.approx(gained.std(ddof=1) / 2)
     assert f"change the loss by {gained.mean():+.4f} ± " in found.table()
     saved = json.loads(found.save(tmp_path / "held.json").read_text())
     assert saved["varied"]["losses"] == varied.losses.tolist()

@@ -154,12 +154,16 @@ def test_rare_events_of_a_binomial_occur(monkeypatch, last, expected):
     each = lambda self: torch.full((self._state.cells,), next(draws), dtype=torch.float64)
     monkeypatch.setattr(Draws, "random", each)
 
+    cells_seen = []
+
     def draw(cells):
-        cells.mark = cells.binomial(1, 5e-8)
+        cells.mark = found = cells.binomial(1, 5e-8)
+        cells_seen.append(found.dtype)
 
     rules = tf.Rules(draw, variables={"mark": 0.0})
     model = tf.Scene(rules, dim=2, founders=tf.Cells.single(2)).bind()
     assert model.step(model.start(), 0.1).mark.tolist() == [expected]
+    assert cells_seen[-1] == torch.float32
 
 
 def test_normal_and_poisson_follow_their_laws():

@@ -84,7 +84,8 @@ def poisson(mean: Tensor, uniform: Tensor) -> Tensor:
     mean ≥ 0 and uniform in (0, 1), float64, any shape. Up to a mean of LARGE the result is exact
     except for the rounding of the sum of probabilities. The first guess is the normal law with its
     corrections. The incomplete gamma function gives its probability (by torch with a relative error
-    of 1e-9), and the search then goes up or down by single terms. Beyond LARGE the guess is off by at most one, once in 10⁴ times.
+    of 1e-9), and the search then goes up or down by single terms. Beyond LARGE the guess is off by
+    at most one, once in 10⁴ times.
     """
     safe = mean.clamp(min=1e-300)
     z = torch.special.ndtri(uniform)

@@ -265,9 +265,7 @@ def value(
     if torch._C._functorch.is_functorch_wrapped_tensor(given):
         instead = "torch.autograd.grad, tf.tangents, or one value for each colony in place of vmap"
         raise input_error(name, "in a transform of torch.func", "a plain tensor", f"Use {instead}.")
-    if given.dim() > 1 or not (
-        given.is_floating_point() or given.dtype in (torch.int32, torch.int64)
-    ):
+    if given.dim() > 1 or given.is_complex() or given.dtype == torch.bool:
         kind = str(given.dtype).removeprefix("torch.")
         raise InputError(
             f"{name} is {kind} of shape {tuple(given.shape)}: it must be one number, or a 1-D"

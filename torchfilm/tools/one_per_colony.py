@@ -29,11 +29,15 @@ def by_position(given: Any) -> Any:
     return np.array(given) if column else given  # a copy, since columns may be read-only
 
 
+def _dtype(given: Any) -> torch.dtype | None:
+    return given.dtype if isinstance(given, Tensor) else None
+
+
 def as_tensor(given: Any) -> Any:
     """A list, an array or a column of a data frame as a tensor of its own; anything else stays.
     Raises TypeError, ValueError or RuntimeError for what holds no numbers."""
     if isinstance(given, (list, tuple)):
-        if any(isinstance(x, (bool, np.bool_)) for x in given):
+        if any(isinstance(x, (bool, np.bool_)) or _dtype(x) == torch.bool for x in given):
             raise TypeError("True and False are no numbers")
         devices = [x.device for x in given if isinstance(x, Tensor)]
         if not devices:

@@ -1,0 +1,60 @@
+"""Where the loss of a design lies, by its losses on some seeds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.stats import binom
+from scipy.stats import t as student
+
+from design.task import Task
+
+LEAST = 4  # fresh seeds of a finalist
+HOLDS = (8, 24)  # fresh seeds of a design that may hold the wanted loss: first, then in all
+BAND = 0.9  # probability of a band
+RESAMPLES = 2000
+
+
+def is_mean(task: Task) -> bool:
+    """Whether the loss of a design is the mean of those of its colonies."""
+    return task.reduce == "mean" and not _reduces_itself(task)
+
+
+def seeds_of_an_end(task: Task) -> int:
+    """Seeds from which on the band of a quantile has an upper end; 1 where it always has one."""
+    if not _is_quantile(task):
+        return 1
+    return math.ceil(math.log(0.5 - BAND / 2) / math.log(float(task.reduce)))
+
+
+def seeds_to_hold(task: Task) -> list[int]:
+    """The fresh seeds on which a design may hold a loss: first, then in all."""
+    return sorted({*HOLDS, max(HOLDS[-1], seeds_of_an_end(task))})
+
+
+def _is_quantile(task: Task) -> bool:
+    """Whether the loss of a design is a quantile of those of its colonies, not of the worst."""
+    return isinstance(task.reduce, float) and task.reduce < 1 and not _reduces_itself(task)
+
+
+def _reduces_itself(task: Task) -> bool:
+    """Whether the target, such as a spread, makes one loss of those of the seeds."""
+    return task.target.reduced(np.zeros((1, LEAST))) is not None
+
+
+def loss_band(task: Task, losses: np.ndarray) -> tuple[float, float]:
+    """Student's interval of a mean; the order statistics that enclose a quantile whatever the
+    distribution (David and Nagaraja, Order Statistics, 2003, 7.1), infinite where the seeds are too
+    few; else the interval of resampled losses."""
+    if is_mean(task):
+        error = losses.std(ddof=1) / np.sqrt(len(losses))
+        wide = float(student.ppf(0.5 + BAND / 2, len(losses) - 1) * error)
+        return float(losses.mean()) - wide, float(losses.mean()) + wide
+    if _is_quantile(task):
+        found = binom.ppf([0.5 - BAND / 2, 0.5 + BAND / 2], len(losses), task.reduce)
+        ends = np.concatenate([[-np.inf], np.sort(losses), [np.inf]])
+        return float(ends[int(found[0])]), float(ends[int(found[1]) + 1])
+    drawn = np.random.default_rng(0).choice(losses, (RESAMPLES, len(losses)))
+    low, high = np.quantile(task.reduced(drawn), [0.5 - BAND / 2, 0.5 + BAND / 2])
+    return float(low), float(high)
