@@ -79,7 +79,7 @@ def bound(rates, dilution):
 def test_dilution_that_the_rates_contain_as_well_gets_a_warning(rates):
     with pytest.warns(UserWarning, match=r"'yfp' loses cell\.growth_rate·yfp, and growth dilutes"):
         bound(rates, True)
-    with pytest.warns(UserWarning, match="growth dilutes it besides, twice in all"):
+    with pytest.warns(UserWarning, match="If that term is dilution, it counts twice"):
         bound(rates, ["yfp"])
 
 
@@ -88,8 +88,34 @@ def test_rates_that_may_lose_a_species_by_growth_get_no_warning():
     for rates in WRITTEN.values():
         bound(rates, False)
         bound(rates, ["cfp"])
+    # a term that is switched off
+    off = lambda u, s, p, cell: {"yfp": p.k - (p.k - 2.0) * cell.growth_rate * u.yfp}
+    bound(off, True)
+    # of µm/h, which dilutes by the length
+    circuit = tf.Circuit(WRITTEN["a term"], species=["yfp"], k=2.0)
+    growth = tf.Growth(rate=0.7, law="linear")
+    tf.Scene(growth, circuit, founders=tf.Cells.single(2), dt=0.1).bind()
     # more is made in cells that grow faster
     faster = lambda u, s, p, cell: {"yfp": p.k * cell.growth_rate * u.cfp - 2 * u.yfp}
     bound(faster, True)
     # an enzyme that is made as cells grow
     bound(lambda u, s, p, cell: {"yfp": p.k - cell.growth_rate * u.yfp / (1 + u.yfp)}, True)
+
+
+def test_what_is_said_of_dilution_is_allowed():
+    with pytest.warns(UserWarning, match=r"it counts twice: leave it out of the rates\.$"):
+        circuit = tf.Circuit(WRITTEN["a reaction"], species="yfp", k=2.0, method="direct")
+        tf.Scene(tf.Growth(rate=0.7), circuit, founders=tf.Cells.single(2), dt=0.1).bind()
+    with pytest.warns(UserWarning, match="or 'yfp' out of dilution=…"):
+        bound(WRITTEN["a term"], True)
+
+
+@pytest.mark.filterwarnings("error")
+def test_rates_that_no_equations_can_be_made_of_run_as_before():
+    def rates(u, s, p, cell):
+        if type(u.yfp) is not torch.Tensor:
+            raise KeyError("no tensor")
+        return {"yfp": p.k - cell.growth_rate * u.yfp}
+
+    model = bound(rates, True)
+    assert model.step(model.start()).fields["yfp"].item() > 0

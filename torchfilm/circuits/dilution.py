@@ -89,17 +89,17 @@ class Start:
         return {n: scaled(x, by) if n in own else x for n, x in self._half_way.items()}
 
 
-def written_dilution(graph: CircuitGraph) -> list[str]:
+def written_dilution(graph: CircuitGraph, known: Mapping[str, float]) -> list[str]:
     """The species whose rates lose cell.growth_rate times their own level: ∂²rate/∂rate of growth
-    ∂level is −1 everywhere."""
+    ∂level is −1 everywhere. known: constants that have one value."""
     make, found = graph.builder, []
-    growth = make.name("cell.growth_rate")
+    by_growth = derivatives(make, graph.rates.values(), make.name("cell.growth_rate"))
     for name, rate in graph.rates.items():
-        by_growth = derivatives(make, [rate], growth).get(rate)
-        level = make.name(f"u.{name}")
-        both = derivatives(make, [by_growth], level).get(by_growth) if by_growth else None
+        slope = by_growth.get(rate)
+        both = derivatives(make, [slope], make.name(f"u.{name}")).get(slope) if slope else None
         if both is not None:
-            slopes = replace(graph, rates={name: both}, releases={}).at_random(0, 0.2, 2.0)
+            only = replace(graph, rates={name: both}, releases={})
+            slopes = only.at_random(0, 0.2, 2.0, **known)
             if len(slopes) and np.allclose(slopes, -1.0, rtol=1e-9, atol=0.0):
                 found.append(name)
     return found

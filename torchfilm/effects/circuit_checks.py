@@ -5,17 +5,19 @@ from __future__ import annotations
 import dataclasses
 import difflib
 from collections.abc import Container, Iterable, Mapping, Sequence, Set
-from numbers import Integral
+from contextlib import suppress
+from numbers import Integral, Real
 from typing import Any
 
 from torch import Tensor
 
 from torchfilm.circuits import integrators
 from torchfilm.circuits.dilution import written_dilution
-from torchfilm.circuits.names import unknown
+from torchfilm.circuits.graph import graph_of
+from torchfilm.circuits.names import label_of, unknown
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.signals.schedule import Schedule
-from torchfilm.state import PER_CELL, RESERVED
+from torchfilm.state import PER_CELL, RESERVED, State
 from torchfilm.tools import checks
 from torchfilm.tools.row_checks import check_field, is_name
 from torchfilm.tools.warn_once import warn
@@ -236,12 +238,13 @@ def check_levels(circuit: Any, fields: Mapping[str, Tensor], free: Container[str
             check_field(fields, name, lambda x: x < 0, "at least 0")
 
 
-def check_read(circuit: Any, seen: Mapping[str, set[str]]) -> None:
+def check_read(circuit: Any, seen: Mapping[str, set[str]], state: State) -> None:
     """Raise InputError for a constant of a circuit that looks like another name; warn of one that
     no rate reads, and of dilution that is counted twice. seen: the names that rates read, of
     constants, "p", and of cells, "cell"."""
     given, read = circuit.parameters, seen["p"]
-    if circuit.dilution and "growth_rate" in seen["cell"]:
+    growth = state.declared.get("growth_rate")
+    if circuit.dilution and "growth_rate" in seen["cell"] and growth and "1/h" in growth.unit:
         _warn_of_dilution(circuit)
     own = {f.name for f in dataclasses.fields(circuit)}
     options = sorted(own - {"rates", "species", "parameters"})
@@ -263,14 +266,23 @@ def check_read(circuit: Any, seen: Mapping[str, set[str]]) -> None:
 def _warn_of_dilution(circuit: Any) -> None:
     """Warn where rates lose what growth dilutes besides. Rates that cannot be written as equations
     are not looked at."""
-    try:
-        graphs = circuit.graphs.values()
-    except checks.InputError:
-        return
     diluted = circuit.species if circuit.dilution is True else circuit.dilution
-    for name in dict.fromkeys(n for g in graphs for n in written_dilution(g) if n in diluted):
+    counts = circuit.method in (LEAP, DIRECT)  # all are diluted
+    for name in dict.fromkeys(n for n in _written(circuit) if n in diluted):
         warn(
             f"{circuit.value_owner()}: the rate of {name!r} loses cell.growth_rate·{name}, and"
-            " growth dilutes it besides, twice in all. Leave that term out of the rates, or give"
-            " dilution=False."
+            " growth dilutes it besides. If that term is dilution, it counts twice: leave it out"
+            f" of the rates{'' if counts else f', or {name!r} out of dilution=…'}."
         )
+
+
+def _written(circuit: Any) -> list[str]:
+    """The species whose rates lose cell.growth_rate times their level."""
+    numbers = {n: float(x) for n, x in circuit.parameters.items() if isinstance(x, Real)}
+    known = {f"p.{n}" if n in circuit.species else n: x for n, x in numbers.items()}
+    names, found = (tuple(circuit.variables), tuple(circuit.parameters)), []
+    for part in circuit.rates.values():
+        # a function may do with equations what it likes; `circuit.graphs` says what
+        with suppress(Exception):
+            found += written_dilution(graph_of(part, *names, label_of(part)), known)
+    return found

@@ -41,9 +41,9 @@ def time_course(
     dpi: float = 160,
 ) -> Picture:
     """Draw the number of cells of each colony against time, and below it the mean of each quantity
-    over its cells; of up to four lines also the band from 10 to 90 % of the cells. Replicates,
-    which are colonies of the same parameters, are thin lines of one colour, beside the mean of
-    those that have cells.
+    over its cells; of up to four lines also the band from 10 to 90 % of the cells. Where
+    colonies differ in parameters, those of the same ones are thin lines of one colour, without a
+    band, beside the mean of those that have cells.
 
     what: a results file, or its path. quantities: fields of the cells, or signals at them as
     "out.NAME". by: a field of whole numbers, such as "cell_type": cells of each are counted apart,
