@@ -141,8 +141,8 @@ def _fresh(
     losses = worst_of_sizes([_tested(study, point, size, first=first) for size in sizes])
     if len(losses) < LEAST:
         return None
-    rivals = {p.tobytes() for e in study.finals if _stage(e) == FIRST_STREAM for p in e.points}
-    chosen = first == HOLD_STREAM or (first == FIRST_STREAM and len(rivals) > 1)
+    several = len(_known(study)) > 1
+    chosen = first == HOLD_STREAM or (first == FIRST_STREAM and several)
     return FreshLosses(
         losses, float(task.reduced(losses[None])[0]), loss_band(task, losses), chosen
     )

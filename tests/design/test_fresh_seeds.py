@@ -11,7 +11,14 @@ from searching import Level, lit, mean
 
 from design import NSGA2, Burden, Finals, Parameter, Search, Sobol, Study, Target
 from design.entries import Entry
-from design.finals import FIRST_STREAM, SOUND_STREAM, FreshLosses, is_certain
+from design.finals import (
+    CHECK_STREAM,
+    FIRST_STREAM,
+    HOLD_STREAM,
+    SOUND_STREAM,
+    FreshLosses,
+    is_certain,
+)
 from design.report import fresh_words
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
@@ -70,11 +77,12 @@ class Uneven(Target):
 
 def test_a_loss_that_no_fresh_seed_has_tested_is_low_by_luck():
     method = Sobol(batch=4)
-    uneven = Search(lit, LIT, Uneven(), method=method, cells=3, replicates=2, finals=None)
     words = "not tested on fresh seeds: where seeds matter"
-    assert words in uneven.run(16, progress=False).table()
+    for replicates in (1, 2):
+        made = uneven(method=method, finals=None, replicates=replicates)
+        assert words in made.run(16, progress=False).table()
     # one design is no choice, and alike seeds are no luck
-    assert words not in dataclasses.replace(uneven).run(2, progress=False).table()
+    assert words not in uneven(finals=None).run(2, progress=False).table()
     alike = Search(lit, LIT, Level(), method=method, cells=3, replicates=2, finals=None)
     assert words not in alike.run(16, progress=False).table()
 
@@ -85,6 +93,31 @@ def test_the_table_counts_fresh_seeds_that_failed():
     fresh = FreshLosses(losses, float(losses.mean()), (0.0, 1.0))
     assert "4 seeds; 1 of them failed, each counts 1.5000" in fresh_words(task, fresh)
     assert "failed" not in fresh_words(task, FreshLosses(losses[:2], 0.15, (0.0, 1.0)))
+
+
+def uneven(**options) -> Search:
+    options = {"method": Sobol(batch=8), "cells": 3, "replicates": 2} | options
+    return Search(lit, LIT, Uneven(), **options)
+
+
+def test_seeds_that_a_larger_budget_adds_have_chosen_nothing():
+    made = uneven(finals=Finals(most=1))
+    few = made.run(40, progress=False)
+    more = made.run(60, progress=False)
+    assert len(more.losses) > len(few.losses) and not few.fresh.chosen and not more.fresh.chosen
+
+
+def test_a_quantile_that_takes_more_seeds_than_the_finals_have_ends_no_search():
+    made = uneven(reduce=0.99)
+    with pytest.warns(
+        UserWarning, match="holds a loss of reduce=0.99 on 299 fresh seeds"
+    ):
+        made.run(200, stop_at=1e3, progress=False)
+    assert not any(HOLD_STREAM <= e.streams[0] < CHECK_STREAM for e in made.study.finals)
+    assert made.study.colonies > 190
+    # of a mean 24 are enough, also beyond the share
+    held = uneven().run(60, stop_at=1e3, progress=False)
+    assert len(held.losses) == 24 and held.fresh.chosen
 
 
 @dataclasses.dataclass(frozen=True)
