@@ -27,10 +27,9 @@ from design.task import Task
 from torchfilm import checks
 
 FIRST_STREAM = 1_000_000  # beyond the streams of searches and robustness checks
-HOLD_STREAM = 1_500_000  # of the test of a wanted loss
 CHECK_STREAM = 2_000_000  # of the check of the winner
 SOUND_STREAM = 3_000_000  # of what shows whether seeds matter
-STAGES = SOUND_STREAM, CHECK_STREAM, HOLD_STREAM, FIRST_STREAM
+STAGES = SOUND_STREAM, CHECK_STREAM, FIRST_STREAM
 CHECK = 1 / 3  # of the colonies of finals with several designs
 MOST_SHARE = 0.9  # of a budget
 ALIKE = 0.02  # designs that are nearer in every coordinate count as one
@@ -89,10 +88,11 @@ class Finals(metaclass=checks.KnownKeywords):
         return self.share * budget / sum(self.sizes)
 
     def can_hold(self, task: Task, budget: float) -> bool:
-        """Whether the seeds on which a design may hold a loss fit: those that a quantile takes
-        beyond the usual ones come from the share of the budget."""
+        """Whether the budget has the seeds on which a design may hold a loss: those that a quantile
+        takes beyond the usual ones come from the share of the finals."""
         seeds = seeds_to_hold(task)[-1]
-        return seeds <= HOLDS[-1] or seeds <= self._rows(budget)
+        fits = seeds * sum(self.sizes) + task.replicates <= budget
+        return fits and (seeds <= HOLDS[-1] or seeds <= self._rows(budget))
 
     def colonies(self, budget: float, certain: bool = False) -> float:
         """Colonies of the finals of a search of `budget` colonies. certain: seeds make no
@@ -120,18 +120,10 @@ class FreshLosses:
 def fresh_losses(
     task: Task, study: Study, sizes: Sequence[float], point: np.ndarray
 ) -> FreshLosses | None:
-    """Of a design (D,), those of the check where it was checked, else those of the finals or of the
-    test of a wanted loss; None before it was grown on LEAST seeds at all sizes."""
+    """Of a design (D,), those of the check where it was checked; None before it was grown on LEAST
+    seeds at all sizes."""
     checked = _fresh(task, study, sizes, point, CHECK_STREAM)
-    return checked or _choosing(task, study, sizes, point)
-
-
-def _choosing(
-    task: Task, study: Study, sizes: Sequence[float], point: np.ndarray
-) -> FreshLosses | None:
-    """Of the seeds that choose among designs."""
-    finals = _fresh(task, study, sizes, point, FIRST_STREAM)
-    return finals or _fresh(task, study, sizes, point, HOLD_STREAM)
+    return checked or _fresh(task, study, sizes, point, FIRST_STREAM)
 
 
 def _fresh(
@@ -141,11 +133,16 @@ def _fresh(
     losses = worst_of_sizes([_tested(study, point, size, first=first) for size in sizes])
     if len(losses) < LEAST:
         return None
-    several = len(_known(study)) > 1
-    chosen = first == HOLD_STREAM or (first == FIRST_STREAM and several)
+    chosen = first == FIRST_STREAM and (len(_known(study)) > 1 or _was_to_hold(study, point))
     return FreshLosses(
         losses, float(task.reduced(losses[None])[0]), loss_band(task, losses), chosen
     )
+
+
+def _was_to_hold(study: Study, point: np.ndarray) -> bool:
+    """Whether a few seeds decided that a design (D,) was grown on those that hold a loss."""
+    part = tuple(range(FIRST_STREAM + HOLDS[0], FIRST_STREAM + HOLDS[1]))
+    return any(e.streams == part and (e.points == point).all(1).any() for e in study.finals)
 
 
 def fresh_goals(
@@ -214,7 +211,7 @@ def winner(task: Task, study: Study, sizes: Sequence[float]) -> np.ndarray | Non
     """The point (D,) of the design whose band ends lowest: few seeds make a wide band of a mean.
     But few seeds make a low quantile. So elsewhere a design must also be as good as those with
     fewer seeds on the seeds of these. None before a design was grown on fresh seeds."""
-    found = ((_choosing(task, study, sizes, p), p) for p in _known(study))
+    found = ((_fresh(task, study, sizes, p, FIRST_STREAM), p) for p in _known(study))
     known = [(fresh, p) for fresh, p in found if fresh is not None]
     # where every colony fails, a narrow band says nothing; few seeds set no end to a quantile
     ends = lambda x: (
@@ -293,14 +290,13 @@ class FinalsRun:
         return any(self._holds(point, wanted) for point in points.values())
 
     def _holds(self, point: np.ndarray, wanted: float) -> bool:
-        known, end = (self.task, self.study, self.finals.sizes, point, HOLD_STREAM), math.inf
         for seeds in seeds_to_hold(self.task):
-            if time.monotonic() >= self.deadline or not self._grow([point], seeds, HOLD_STREAM):
+            if time.monotonic() >= self.deadline:
                 return False
-            if (found := _fresh(*known)) is None or found.loss > wanted:
+            if not self._grow([point], seeds) or self._loss(seeds, point) > wanted:
                 return False
-            end = found.band[1]
-        return end <= wanted
+        found = _fresh(self.task, self.study, self.finals.sizes, point, FIRST_STREAM)
+        return found is not None and found.band[1] <= wanted
 
     def _front(self) -> None:
         """Grow designs from all parts of the front, as many as LEAST seeds of each allow."""

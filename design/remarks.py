@@ -37,9 +37,10 @@ def remark_on_stop_at(task: Task, finals: Finals | None, budget: float) -> None:
     if finals is not None and not finals.can_hold(task, budget):
         seeds = seeds_to_hold(task)[-1]
         checks.warn(
-            f"stop_at: a design holds a loss of reduce={task.reduce:g} on {seeds} fresh seeds, more"
-            f" than the share of {budget:g} colonies that the finals have, so that the search does"
-            " not end early. Give more colonies or Finals(share=…), or a reduce nearer to 0.5."
+            f"stop_at: a design of reduce={task.reduce!r} holds a loss on {seeds} fresh seeds, at"
+            f" {displays.counted(len(finals.sizes), 'size')}. The finals of a search of"
+            f" {budget:g} colonies do not have them, so that it does not end early. Give more"
+            " colonies, or Finals(share=…)."
         )
 
 

@@ -258,7 +258,10 @@ def _lucky(report: SearchReport) -> str:
 
 def _untested(report: SearchReport) -> str:
     """That the loss is the lowest of several that may differ by chance; else ""."""
-    full = report.study.full()
+    full, found = report.study.full(), report.study.best()
+    best, failed = report.best, report.task.target.failed
+    if report.task.goals or found is None or not best.loss <= min(found[1], failed * (1 - 1e-9)):
+        return ""
     several = sum(len(e.losses) for e in full) > 1
     chance = any(
         e.replicates == 1 or (np.ptp(e.losses, axis=1) > DIFFERENT * np.abs(e.losses).max()).any()
@@ -348,8 +351,8 @@ def _misses(target: Target, best: ReportedDesign) -> str:
         " (Measured.of_colonies, or values by time and colony). "
         if has_mean_with_error(target)
         else "colonies that grew as the observed ones did have a loss of about 1 where many were"
-        " observed (of n some (n − 1)/(n − 3): 2 of five, 4 or more of one or two, which do not"
-        " tell how much colonies differ). "
+        " observed (of n some (1 + 1/n)(n − 1)/(n − 3): 2.4 of five, 4 or more of one or two, which"
+        " do not tell how much colonies differ). "
     )
     return (
         f"{like if target.evidence else ''}The best design is off most in {words}. Search longer,"

@@ -129,8 +129,9 @@ class Robustness:
             known = "" if math.isnan(error) else f" ± {error:.4f}"
             lines.append(
                 f"all parameters at once (z: normal numbers) change the loss by {change:+.4f}"
-                f"{known} on the same {len(np.unique(self.varied.streams))} seeds"
-                + f"; bounds held {self.varied.clipped:.0%} of them"
+                f"{known} on the same"
+                f" {displays.counted(len(np.unique(self.varied.streams)), 'seed')}"
+                + f"; bounds held {self.varied.clipped:.0%} of the varied values"
                 * (self.varied.clipped > 0)
             )
         lines += ["", *displays.aligned(self._change_rows(), left=(0,))]

@@ -25,10 +25,9 @@ class Indices:
     """Sobol' indices of the loss over the whole space, (D,) each.
 
     first: the share of the loss's variance that a parameter explains alone; total: its share with
-    all its interactions. first_error, total_error:
-    standard errors of independent points, by resampling. Sobol points are more even, so that the
-    errors are smaller: from two to five times on smooth losses. samples; colonies: how many were
-    grown for it.
+    all its interactions. first_error, total_error: standard errors of independent points, by
+    resampling. Sobol points are more even, so that the errors are smaller: from two to five times
+    on smooth losses. samples; colonies: how many were grown for it.
     """
 
     first: np.ndarray

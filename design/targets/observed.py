@@ -51,16 +51,16 @@ class Observed(Target):
     seen from above, in the x–y plane.
 
     Loss: the mean over the statistics of ((statistic − value)/spread)². It is about 1 for a colony
-    that grew as the observed ones did, where many were observed, and some (n − 1)/(n − 3) of n.
-    Beyond 100 spreads a square grows linearly (Huber), so that data which are far off still tell a
-    search where to go.
+    that grew as the observed ones did, where many were observed, and some (1 + 1/n)(n − 1)/(n − 3)
+    of n. Beyond 100 spreads a square grows linearly (Huber), so that data which are far off still
+    tell a search where to go.
 
     spread is bootstrapped: the cells of each colony are drawn 200 times with replacement; the
     number of cells has 1/√N, as if divisions were independent. This leaves out what all cells of a
     colony share. With 3 colonies or more, it is the standard deviation between them where that is
     greater, and for the number of cells in any case. Spreads are at least 1 % of the greatest
     statistic of their kind; that of the number of cells is at least 2 %, and half a cell. Of one or
-    two colonies the loss of a right model is up to 5.
+    two colonies the loss of a right model is 4 or more.
     """
 
     differentiable = True

@@ -11,14 +11,7 @@ from searching import Level, lit, mean
 
 from design import NSGA2, Burden, Finals, Parameter, Search, Sobol, Study, Target
 from design.entries import Entry
-from design.finals import (
-    CHECK_STREAM,
-    FIRST_STREAM,
-    HOLD_STREAM,
-    SOUND_STREAM,
-    FreshLosses,
-    is_certain,
-)
+from design.finals import FIRST_STREAM, SOUND_STREAM, FreshLosses, is_certain
 from design.report import fresh_words
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
@@ -107,14 +100,19 @@ def test_seeds_that_a_larger_budget_adds_have_chosen_nothing():
     assert len(more.losses) > len(few.losses) and not few.fresh.chosen and not more.fresh.chosen
 
 
-def test_a_quantile_that_takes_more_seeds_than_the_finals_have_ends_no_search():
-    made = uneven(reduce=0.99)
-    with pytest.warns(
-        UserWarning, match="holds a loss of reduce=0.99 on 299 fresh seeds"
-    ):
-        made.run(200, stop_at=1e3, progress=False)
-    assert not any(HOLD_STREAM <= e.streams[0] < CHECK_STREAM for e in made.study.finals)
-    assert made.study.colonies > 190
+@pytest.mark.parametrize(
+    ("colonies", "options", "seeds"),
+    [
+        (200, {"reduce": 0.99}, "299 fresh seeds, at 1 size"),
+        (25, {}, "24 fresh seeds, at 1 size"),
+        (60, {"finals": Finals(sizes=(1, 2))}, "24 fresh seeds, at 2 sizes"),
+    ],
+)
+def test_a_budget_without_the_seeds_that_hold_a_loss_is_warned_of(colonies, options, seeds):
+    made = uneven(**options)
+    with pytest.warns(UserWarning, match=f"stop_at: .* holds a loss on {seeds}"):
+        made.run(colonies, stop_at=1e3, progress=False)
+    assert made.study.searched > 0.7 * colonies
     # of a mean 24 are enough, also beyond the share
     held = uneven().run(60, stop_at=1e3, progress=False)
     assert len(held.losses) == 24 and held.fresh.chosen

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+
+import numpy as np
 import pytest
 import torch
 
@@ -119,3 +122,20 @@ def test_rates_that_no_equations_can_be_made_of_run_as_before():
 
     model = bound(rates, True)
     assert model.step(model.start()).fields["yfp"].item() > 0
+
+
+@pytest.mark.parametrize("name", ["k", "low", "seed"])
+@pytest.mark.parametrize("value", [2.0, np.float32(2.0), torch.tensor(2.0)], ids=type)
+def test_dilution_is_judged_at_the_values_of_constants(name, value):
+    """A factor that is 1 for this value."""
+
+    def rates(u, s, p, cell):
+        return {"yfp": 1.0 - (getattr(p, name) - 1.0) * cell.growth_rate * u.yfp}
+
+    for growing, wanted in ((value, True), (value + 1, False)):
+        circuit = tf.Circuit(rates, species="yfp", **{name: growing})
+        scene = tf.Scene(tf.Growth(rate=0.7), circuit, founders=tf.Cells.single(2), dt=0.1)
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            scene.bind()
+        assert any("it counts twice" in str(w.message) for w in found) == wanted

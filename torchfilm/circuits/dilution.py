@@ -99,7 +99,7 @@ def written_dilution(graph: CircuitGraph, known: Mapping[str, float]) -> list[st
         both = derivatives(make, [slope], make.name(f"u.{name}")).get(slope) if slope else None
         if both is not None:
             only = replace(graph, rates={name: both}, releases={})
-            slopes = only.at_random(0, 0.2, 2.0, **known)
+            slopes = only.at_random(0, 0.2, 2.0, known)
             if len(slopes) and np.allclose(slopes, -1.0, rtol=1e-9, atol=0.0):
                 found.append(name)
     return found

@@ -250,12 +250,12 @@ class CircuitGraph:
                 found.append({n: w for n, w in zip(rows, weights, strict=True) if w})
         return still + found
 
-    def at_random(self, seed: int, low: float, high: float, **known: float) -> np.ndarray:
+    def at_random(self, seed: int, low: float, high: float, known: Mapping = {}) -> np.ndarray:
         """Rates of amounts in a cell of volume 1 at PLACES random places, all values from low to
         high, even by their logarithms; (K, rows), of the places where all are finite."""
         rng = np.random.default_rng(seed)
         draw = lambda: np.exp(rng.uniform(np.log(low), np.log(high), PLACES))
-        values = {n: draw() for n in self._keys()} | {"cell.volume": np.ones(PLACES)} | known
+        values = {n: draw() for n in self._keys()} | {"cell.volume": np.ones(PLACES), **known}
         found = self.evaluate(values).values()
         columns = [np.broadcast_to(x.numpy(), (PLACES,)) for x in found]
         rates = np.stack(columns, 1) if columns else np.zeros((PLACES, 0))

@@ -278,11 +278,14 @@ def _warn_of_dilution(circuit: Any) -> None:
 
 def _written(circuit: Any) -> list[str]:
     """The species whose rates lose cell.growth_rate times their level."""
-    numbers = {n: float(x) for n, x in circuit.parameters.items() if isinstance(x, Real)}
-    known = {f"p.{n}" if n in circuit.species else n: x for n, x in numbers.items()}
-    names, found = (tuple(circuit.variables), tuple(circuit.parameters)), []
+    names, known, found = (tuple(circuit.variables), tuple(circuit.parameters)), {}, []
+    for name, x in circuit.parameters.items():
+        if isinstance(x, Real) or (isinstance(x, Tensor) and x.numel() == 1):
+            known[f"p.{name}" if name in circuit.variables else name] = float(x)
     for part in circuit.rates.values():
+        graph = None
         # a function may do with equations what it likes; `circuit.graphs` says what
         with suppress(Exception):
-            found += written_dilution(graph_of(part, *names, label_of(part)), known)
+            graph = graph_of(part, *names, label_of(part))
+        found += written_dilution(graph, known) if graph else []
     return found

@@ -26,6 +26,8 @@ from torchfilm.tools.whole_files import write_whole as write_whole
 Number = float | int
 F = TypeVar("F", bound=Callable[..., Any])
 ONE_OR_EACH = "Give one number, or one per colony."
+WHOLE = torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64
+NUMBERS = (*WHOLE, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 
 
 class InputError(ValueError):
@@ -265,11 +267,11 @@ def value(
     if torch._C._functorch.is_functorch_wrapped_tensor(given):
         instead = "torch.autograd.grad, tf.tangents, or one value for each colony in place of vmap"
         raise input_error(name, "in a transform of torch.func", "a plain tensor", f"Use {instead}.")
-    if given.dim() > 1 or given.is_complex() or given.dtype == torch.bool:
+    if given.dim() > 1 or given.dtype not in NUMBERS or given.layout != torch.strided:
         kind = str(given.dtype).removeprefix("torch.")
         raise InputError(
-            f"{name} is {kind} of shape {tuple(given.shape)}: it must be one number, or a 1-D"
-            " tensor of numbers, one per colony."
+            f"{name} is {kind} of shape {tuple(given.shape)}: it must be one number, or a dense"
+            " 1-D tensor of real numbers, one per colony."
         )
     given = given if given.is_floating_point() else given.double()
     detached = given.detach()
