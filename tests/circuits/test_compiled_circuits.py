@@ -152,6 +152,7 @@ def clock(u, s, p, cell):
     return {"a": 0.1 + cell.time * 0.1 / 3 - u.a * cell.growth_rate, "b": 1, "c": 0.0 * u.a}
 
 
+@pytest.mark.filterwarnings("ignore:.* growth dilutes it besides")
 def test_time_is_that_of_each_step(dtype, plain):
     """Read anew in each step; rates that are numbers, and one that is always 0."""
     circuit = tf.Circuit(clock, species=("a", "b", "c", "still"))
