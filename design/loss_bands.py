@@ -16,6 +16,12 @@ BAND = 0.9  # probability of a band
 RESAMPLES = 2000
 
 
+def standard_error(losses: np.ndarray) -> float:
+    """Of the mean of independent losses (S,); NaN of one."""
+    count = len(losses)
+    return float(losses.std(ddof=1)) / math.sqrt(count) if count > 1 else math.nan
+
+
 def is_mean(task: Task) -> bool:
     """Whether the loss of a design is the mean of those of its colonies."""
     return task.reduce == "mean" and not _reduces_itself(task)
@@ -48,8 +54,7 @@ def loss_band(task: Task, losses: np.ndarray) -> tuple[float, float]:
     distribution (David and Nagaraja, Order Statistics, 2003, 7.1), infinite where the seeds are too
     few; else the interval of resampled losses."""
     if is_mean(task):
-        error = losses.std(ddof=1) / np.sqrt(len(losses))
-        wide = float(student.ppf(0.5 + BAND / 2, len(losses) - 1) * error)
+        wide = float(student.ppf(0.5 + BAND / 2, len(losses) - 1) * standard_error(losses))
         return float(losses.mean()) - wide, float(losses.mean()) + wide
     if _is_quantile(task):
         found = binom.ppf([0.5 - BAND / 2, 0.5 + BAND / 2], len(losses), task.reduce)

@@ -258,16 +258,18 @@ def _lucky(report: SearchReport) -> str:
 
 def _untested(report: SearchReport) -> str:
     """That the loss is the lowest of several that may differ by chance; else ""."""
-    full, found = report.study.full(), report.study.best()
-    best, failed = report.best, report.task.target.failed
-    if report.task.goals or found is None or not best.loss <= min(found[1], failed * (1 - 1e-9)):
+    best, found, failed = report.best, report.study.best(), report.task.target.failed
+    if best.fresh is not None or report.task.goals or found is None:
         return ""
+    if not best.loss <= min(found[1], failed * (1 - 1e-9)):
+        return ""
+    full = report.study.full()
     several = sum(len(e.losses) for e in full) > 1
     chance = any(
         e.replicates == 1 or (np.ptp(e.losses, axis=1) > DIFFERENT * np.abs(e.losses).max()).any()
         for e in full
     )
-    if report.best.fresh is not None or not (several and chance):
+    if not (several and chance):
         return ""
     return (
         "not tested on fresh seeds: where seeds matter, the lowest of several losses is low partly"

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 import torchfilm as tf
+from design.loss_bands import standard_error
 from design.parameters import Value, show_value
 from design.robustness_plots import draw_changes, draw_indices, draw_losses
 from design.sensitivity import Indices
@@ -213,8 +214,7 @@ class Robustness:
 
 
 def _summary(losses: np.ndarray) -> tuple[str, ...]:
-    count = len(losses)
-    error = f"{losses.std(ddof=1) / math.sqrt(count):.4f}" if count > 1 else ""
+    error = "" if math.isnan(by := standard_error(losses)) else f"{by:.4f}"
     mean, median, high = losses.mean(), np.median(losses), np.quantile(losses, 0.9)
     return f"{mean:.4f}", error, f"{median:.4f}", f"{high:.4f}"
 

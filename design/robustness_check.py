@@ -3,13 +3,13 @@ that matter."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from typing import Any, Protocol
 
 import numpy as np
 
+from design.loss_bands import standard_error
 from design.objective import Objective
 from design.parameters import Choice, Parameter, Space, Value
 from design.progress import advance, open_bar
@@ -214,6 +214,6 @@ def _measured_change(
     before: np.ndarray,
 ) -> ParameterChange:
     gained = losses - before
-    error = float(gained.std(ddof=1)) / math.sqrt(len(gained)) if len(gained) > 1 else math.nan
+    error = standard_error(gained)
     value = parameter.value(float(point[k]))
     return ParameterChange(parameter.name, wanted, value, losses, float(gained.mean()), error)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
 
+from design.loss_bands import standard_error
 from design.objective import Objective
 from design.parameters import Choice, Parameter
 
@@ -34,9 +34,7 @@ class Varied:
         losses: (S,), of the design, on each stream."""
         each = np.unique(self.streams)
         gained = np.array([(self.losses[self.streams == k] - losses[k]).mean() for k in each])
-        count = len(gained)
-        error = float(gained.std(ddof=1)) / math.sqrt(count) if count > 1 else math.nan
-        return float(gained.mean()), error
+        return float(gained.mean()), standard_error(gained)
 
 
 def varied(

@@ -251,8 +251,8 @@ class CircuitGraph:
         return still + found
 
     def at_random(self, seed: int, low: float, high: float, known: Mapping = {}) -> np.ndarray:
-        """Rates of amounts in a cell of volume 1 at PLACES random places, all values from low to
-        high, even by their logarithms; (K, rows), of the places where all are finite."""
+        """Rates of amounts in a cell of volume 1 at PLACES random places, values but those `known`
+        from low to high, even by their logarithms; (K, rows), of places where all are finite."""
         rng = np.random.default_rng(seed)
         draw = lambda: np.exp(rng.uniform(np.log(low), np.log(high), PLACES))
         values = {n: draw() for n in self._keys()} | {"cell.volume": np.ones(PLACES), **known}
