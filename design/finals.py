@@ -145,11 +145,9 @@ def _was_to_hold(study: Study, point: np.ndarray) -> bool:
     return any(e.streams == part and (e.points == point).all(1).any() for e in study.finals)
 
 
-def fresh_goals(
-    task: Task, study: Study, sizes: Sequence[float]
-) -> tuple[np.ndarray, np.ndarray, int] | None:
-    """Points (F, D) of the designs on which the last finals ended, their goals (F, G), of each seed
-    the worst of its sizes, and the seeds of each. None before there are any."""
+def fresh_goals(study: Study, sizes: Sequence[float]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Points (F, D) of the designs on which the last finals ended, and their goals on each fresh
+    seed (F, S, G), the worst of all sizes. None before there are any."""
     last = [e for e in study.finals if e.size in sizes and e.each_goals is not None][-1:]
     seeds = max((e.streams[-1] + 1 - FIRST_STREAM for e in last), default=0)
     points = _known(study)
@@ -160,9 +158,7 @@ def fresh_goals(
     whole = [(p, goals[:seeds]) for p, goals in found if len(goals) >= seeds]
     if seeds < LEAST or not whole:
         return None
-    goals = task.reduced_goals(np.array([goals for _, goals in whole]))
-    assert goals is not None
-    return np.array([p for p, _ in whole]), goals, seeds
+    return np.array([p for p, _ in whole]), np.array([goals for _, goals in whole])
 
 
 def worst_of_sizes(each: Sequence[np.ndarray]) -> np.ndarray:

@@ -14,6 +14,7 @@ from design.best import Best
 from design.entries import Entry
 from design.finals import fresh_goals
 from design.front_plot import draw_front
+from design.loss_bands import goal_errors
 from design.objective import Objective
 from design.parameters import Value, show_value
 from design.pareto import nondominated, spread
@@ -41,16 +42,19 @@ class FrontSearch(Protocol):
 class Front:
     """Designs that no other exceeds in all goals, in order of the first goal.
 
-    search: that found them; titles: of the goals; points (F, D); goals (F, G): their losses; seeds:
-    fresh seeds on which these were measured, 0 where they are those of the search. untested:
-    further designs of the front of the search, for which the finals had no room; `search.front(
-    fresh=False)` has all. `front[k]` is a design as `Best`, with `save`, `colonies`, `table`.
+    search: that found them; titles: of the goals; points (F, D); goals (F, G): their losses; errors
+    (F, G): the standard errors of these by the luck of the seeds, NaN where a goal is no mean of
+    them and where there is one; seeds: fresh seeds on which these were measured, 0 where they are
+    those of the search. untested: further designs of the front of the search, for which the finals
+    had no room; `search.front(fresh=False)` has all. `front[k]` is a design as `Best`, with `save`,
+    `colonies`, `table`.
     """
 
     search: FrontSearch = field(repr=False)
     titles: tuple[str, ...]
     points: np.ndarray = field(repr=False)
     goals: np.ndarray
+    errors: np.ndarray = field(repr=False)
     seeds: int
     untested: int = 0
 
@@ -135,9 +139,9 @@ class Front:
     def _rows(self) -> list[list[str]]:
         names = self.search.objective.task.space.names
         text = [["", *self.titles, *names]]
-        for k, (goals, values) in enumerate(zip(self.goals, self.values, strict=True)):
-            shown = [show_value(values[name]) for name in names]
-            text.append([str(k), *(f"{x:.4g}" for x in goals), *shown])
+        for k, values in enumerate(self.values):
+            goals = map(_with_error, self.goals[k], self.errors[k])
+            text.append([str(k), *goals, *(show_value(values[name]) for name in names)])
         return text
 
     def _where(self) -> str:
@@ -159,6 +163,7 @@ class Front:
             self.titles,
             every,
             self.goals,
+            self.errors,
             colonies,
             self.convergence(),
             self.seeds,
@@ -190,13 +195,17 @@ def front_of(search: FrontSearch, study: Study, sizes: Sequence[float]) -> Front
         raise tf.InputError(
             "no design has been grown to full size yet: run the search for more colonies."
         )
-    fresh = fresh_goals(search.objective.task, study, sizes) if sizes else None
+    fresh, task = fresh_goals(study, sizes) if sizes else None, search.objective.task
     seeds = untested = 0
     points = np.concatenate([e.points for e, _ in full])
     goals = np.concatenate([g for _, g in full])
+    kept = [e.each_goals for e, _ in full if e.each_goals is not None]
+    # files of earlier versions lack them: as of one seed, without an error
+    each = np.concatenate(kept) if len(kept) == len(full) else goals[:, None]
     if fresh is not None:
         known = {p.tobytes() for p in points[nondominated(goals)]}
-        points, goals, seeds = fresh
+        points, each = fresh
+        seeds, goals = each.shape[1], np.asarray(task.reduced_goals(each))
         untested = len(known - {p.tobytes() for p in points})
     rows = nondominated(goals)
     if not len(rows) and seeds:
@@ -207,7 +216,12 @@ def front_of(search: FrontSearch, study: Study, sizes: Sequence[float]) -> Front
         return front_of(search, study, ())
     if not len(rows):
         raise tf.InputError(f"every design failed: {_usual_failure(study.entries)}")
-    return Front(search, target.titles, points[rows], goals[rows], seeds, untested)
+    errors = goal_errors(task, each[rows])
+    return Front(search, target.titles, points[rows], goals[rows], errors, seeds, untested)
+
+
+def _with_error(goal: float, error: float) -> str:
+    return f"{goal:.4g}" + (f" ± {error:.2g}" if np.isfinite(error) else "")
 
 
 def _usual_failure(entries: Iterable[Entry]) -> str:

@@ -20,13 +20,15 @@ def draw_front(
     titles: tuple[str, ...],
     every: np.ndarray,
     front: np.ndarray,
+    errors: np.ndarray,
     colonies: dict[int, list[FinishedColonies]],
     course: tuple[np.ndarray, np.ndarray],
     fresh: int,
 ) -> Figure:
-    """Draw the first two goals of all designs (n, G) and of the front (F, G), a colony of some of
-    its designs, by row, and the hypervolume against colonies simulated. fresh: the number of seeds
-    on which those of the front were measured again, 0 where they are those of the search."""
+    """Draw the first two goals of all designs (n, G) and of the front (F, G) with their standard
+    errors, a colony of some of its designs, by row, and the hypervolume against colonies simulated.
+    fresh: the number of seeds on which those of the front were measured again, 0 where they are
+    those of the search."""
     columns = max(2, len(colonies))
     figure = tf.pictures.new_figure(2.6 * columns, 6.4)
     grid = figure.add_gridspec(2, columns, height_ratios=[1.0, 0.8])
@@ -35,8 +37,9 @@ def draw_front(
             label="every design" + ", on the seeds of the search" * bool(fresh))  # fmt: skip
     if front.shape[1] == 2:  # no design lies between two neighbours: a step, not a slope
         ax.step(front[:, 0], front[:, 1], where="post", color="C3", lw=0.8, zorder=1)
-    ax.plot(front[:, 0], front[:, 1], "D", color="C3", ms=4,
-            label="front" + f", on {fresh} fresh seeds" * bool(fresh))  # fmt: skip
+    across, up = (np.nan_to_num(errors[:, axis]) for axis in (0, 1))  # a bar of 0 where unknown
+    ax.errorbar(front[:, 0], front[:, 1], up, across, "D", color="C3", ms=4, elinewidth=0.8,
+                label="front" + f", on {fresh} fresh seeds" * bool(fresh))  # fmt: skip
     for row in colonies:
         ax.annotate(
             str(row),

@@ -8,6 +8,8 @@ import numpy as np
 from scipy.stats import binom
 from scipy.stats import t as student
 
+from design.targets.base import Target
+from design.targets.goals import Goals
 from design.task import Task
 
 LEAST = 4  # fresh seeds of a finalist
@@ -22,9 +24,21 @@ def standard_error(losses: np.ndarray) -> float:
     return float(losses.std(ddof=1)) / math.sqrt(count) if count > 1 else math.nan
 
 
-def is_mean(task: Task) -> bool:
-    """Whether the loss of a design is the mean of those of its colonies."""
-    return task.reduce == "mean" and not _reduces_itself(task)
+def is_mean(task: Task, target: Target | None = None) -> bool:
+    """Whether the loss of a design is the mean of those of its colonies. target: of which it is the
+    loss; by default that of the task."""
+    return task.reduce == "mean" and not _reduces_itself(target or task.target)
+
+
+def goal_errors(task: Task, losses: np.ndarray) -> np.ndarray:
+    """The standard error of each goal (F, G), from its losses on some seeds (F, S, G). NaN where a
+    goal is not the mean of them, and of one seed."""
+    assert isinstance(task.target, Goals)
+    errors = np.full((len(losses), losses.shape[2]), np.nan)
+    for k, part in enumerate(task.target.parts):
+        if is_mean(task, part):
+            errors[:, k] = [standard_error(x) for x in losses[:, :, k]]
+    return errors
 
 
 def seeds_of_an_end(task: Task) -> int:
@@ -41,12 +55,12 @@ def seeds_to_hold(task: Task) -> list[int]:
 
 def _is_quantile(task: Task) -> bool:
     """Whether the loss of a design is a quantile of those of its colonies, not of the worst."""
-    return isinstance(task.reduce, float) and task.reduce < 1 and not _reduces_itself(task)
+    return isinstance(task.reduce, float) and task.reduce < 1 and not _reduces_itself(task.target)
 
 
-def _reduces_itself(task: Task) -> bool:
-    """Whether the target, such as a spread, makes one loss of those of the seeds."""
-    return task.target.reduced(np.zeros((1, LEAST))) is not None
+def _reduces_itself(target: Target) -> bool:
+    """Whether a target, such as a spread, makes one loss of those of the seeds."""
+    return target.reduced(np.zeros((1, LEAST))) is not None
 
 
 def loss_band(task: Task, losses: np.ndarray) -> tuple[float, float]:

@@ -241,9 +241,9 @@ class Search(TaskOptions):
         proposal = repeat_study(method, task, self.study, known)
         within_reach = check_within_reach(self.objective, self.study)
         while True:
-            if not ((late := self._is_late) and finals) and self._reached(stop_at, finals):
+            if not (self._is_late and finals) and self._reached(stop_at, finals):
                 return True
-            if late:
+            if self._is_late:  # read again: a test of a wanted loss grows colonies
                 self._progress.late = self._room(colonies, False) >= task.colonies_each
                 return False
             in_vain = self.study.searched >= max(IN_VAIN * colonies, LEAST_IN_VAIN)

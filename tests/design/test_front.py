@@ -90,6 +90,23 @@ def test_a_search_with_two_goals_returns_their_front():
     assert "on" in front.table() and "fresh seeds" in front.table()
 
 
+def test_the_goals_of_a_front_have_the_errors_of_their_means():
+    """A goal that is no mean over the seeds has none, and neither has that of one seed."""
+    made = search(targets=[Level(wanted=1.0), Burden(), SpreadOfLosses(Level())])
+    front = made.run(240, progress=False)
+    streams = made.study.finals[-1].streams
+    assert len(streams) == front.seeds >= 4
+    each = made.objective.evaluate(front.points, streams=streams).each_goals
+    wanted = each[:, :, :2].std(1, ddof=1) / np.sqrt(front.seeds)
+    assert (wanted > 0).all() and front.errors[:, :2] == pytest.approx(wanted)
+    assert np.isnan(front.errors[:, 2]).all() and front.table().count(" ± ") == 2 * len(front)
+    shown = f"{front.goals[0, 0]:.4g} ± {front.errors[0, 0]:.2g}"
+    assert shown in front.table()
+    assert (made.front(fresh=False).errors[:, :2] > 0).all()  # of the two seeds of the search
+    alone = search(replicates=1, finals=None).run(40, progress=False)
+    assert np.isnan(alone.errors).all() and "±" not in alone.table()
+
+
 def test_any_design_of_a_front_is_saved_and_drawn(tmp_path):
     front = search(cells=6).run(120, progress=False)
     best = front[1]

@@ -178,6 +178,16 @@ def test_no_design_is_tested_for_its_loss_after_the_hours(tmp_path, capsys, monk
     assert "stopped at 6 of 40 colonies after wall_hours=1; " in capsys.readouterr().err
 
 
+def test_no_batch_begins_where_the_hours_pass_while_a_design_is_tested(capsys, monkeypatch):
+    """The best of the first batch has the wanted loss on its own seeds, and does not hold it."""
+    wanted = ran(40).study.entries[0].loss.min() + 1e-6
+    made = search(finals=Finals(share=0.4, most=2))
+    monkeypatch.setattr("time.monotonic", lambda: 3600.0 if made.study.finals else 0.0)
+    made.run(40, stop_at=wanted, wall_hours=1.0, progress=False)
+    assert made.study.finals and len(made.study.entries) == 1
+    assert "after wall_hours=1; " in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("colonies", "stop_at"), [(24, None), (25, None), (40, 1e9)])
 def test_a_search_that_is_done_as_its_hours_end_is_no_stopped_one(
     colonies, stop_at, capsys, monkeypatch
