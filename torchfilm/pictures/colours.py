@@ -32,6 +32,8 @@ WHEEL = (
 
 # The least range of colours of a concentration, relative to its largest value.
 NARROWEST = 0.01
+# The least of the range of logarithmic colours that is not given, relative to the largest value.
+FAINTEST = 1e-4
 
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -57,6 +59,7 @@ class PlotStyle:
     view: str = "xy"
     section: float | str = CELLS
     whole: bool = False
+    log: bool | str | Sequence[str] = False
 
     @property
     def shows_box(self) -> bool:
@@ -104,22 +107,54 @@ class PlotStyle:
             name = next((n for n in (*self.quantities, self.background) if n and n != ANGLE), "yfp")
             rule = f'ranges by name of a drawn quantity, such as {{"{name}": (0, 2)}}'
             raise checks.input_error("limits", self.limits, rule)
+        self._check_log()
         for name, pair in (self.limits or {}).items():
-            checked_range(f"limits[{name!r}]", pair)
-            if name == ANGLE:
-                raise checks.input_error("limits", name, "left out: its range is 0 to 180°")
-            if self.colour is None and self.channels is None:
-                continue  # it is known from the first frame alone
-            if name not in (*self.quantities, self.background, self.signal):
-                drawn = (
-                    ", ".join(
-                        repr(n)
-                        for n in (*self.quantities, self.background)
-                        if n not in (None, ANGLE)
-                    )
-                    or "nothing that has a range"
-                )
-                raise checks.input_error("limits", name, f"the name of a drawn quantity: {drawn}")
+            low, _ = checked_range(f"limits[{name!r}]", pair)
+            self._check_drawn("limits", name)
+            if self.is_log(name) and low <= 0:
+                rule = "a range above 0, where its colours are logarithmic"
+                raise checks.input_error(f"limits[{name!r}]", pair, rule)
+
+    def _check_log(self) -> None:
+        """Raise InputError unless quantities with a range are drawn by their logarithms."""
+        if isinstance(self.log, bool):
+            if self.log and self.colour in (ANGLE, TYPES) and self.background is None:
+                rule = f"left out: {self.colour} has no range of values"
+                raise checks.input_error("log", True, rule)
+            return
+        if not isinstance(self.log, Sequence) or not all(isinstance(n, str) for n in self.log):
+            rule = 'True, or the names of drawn quantities, such as ["yfp"]'
+            raise checks.input_error("log", self.log, rule)
+        for name in self._logarithmic:
+            self._check_drawn("log", name)
+
+    def _check_drawn(self, option: str, name: str) -> None:
+        """Raise InputError unless `name` is a drawn quantity with a range, as far as is known: what
+        colours cells by default is known from the first frame alone."""
+        if name == ANGLE:
+            raise checks.input_error(option, name, "left out: its range is 0 to 180°")
+        if self.colour is None and self.channels is None:
+            return
+        if name not in (*self.quantities, self.background, self.signal):
+            known = (n for n in (*self.quantities, self.background) if n not in (None, ANGLE))
+            drawn = ", ".join(map(repr, known)) or "nothing that has a range"
+            raise checks.input_error(option, name, f"the name of a drawn quantity: {drawn}")
+
+    @property
+    def _logarithmic(self) -> tuple[str, ...]:
+        """The quantities whose colours are logarithmic, where these are named."""
+        if isinstance(self.log, bool):
+            return ()
+        return (self.log,) if isinstance(self.log, str) else tuple(self.log)
+
+    def is_log(self, name: str) -> bool:
+        """Whether the colours of a quantity are logarithmic. A name without "out." means the cells'
+        quantity of that name, where one is drawn."""
+        if isinstance(self.log, bool):
+            return self.log and name not in (ANGLE, TYPES)
+        if name == self.signal and self.background not in self.quantities:
+            return name in self._logarithmic or self.background in self._logarithmic
+        return name in self._logarithmic
 
     @property
     def quantities(self) -> tuple[str, ...]:
@@ -213,12 +248,14 @@ def values_of(cells: Mapping[str, np.ndarray], name: str, view: str) -> np.ndarr
 class ValueRange:
     """The range of one quantity so far: lowest and highest value.
 
-    kinds: the distinct values while they are integers and at most `most`, else None.
+    least: the lowest above 0. kinds: the distinct values while they are integers and at most
+    `most`, else None.
     """
 
     most: int = len(KINDS)
     low: float = math.inf
     high: float = -math.inf
+    least: float = math.inf
     kinds: set[int] | None = field(default_factory=set)
 
     def add(self, values: np.ndarray) -> None:
@@ -236,6 +273,8 @@ class ValueRange:
                 min(self.low, float(finite.min())),
                 max(self.high, float(finite.max())),
             )
+        if (above := finite[finite > 0]).size:
+            self.least = min(self.least, float(above.min()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +283,8 @@ class Scale:
 
     name: of the quantity. label, unit: for a legend. cmap: the colour map. limits: the range of the
     map. beyond: whether values lie outside the limits ("min", "max", "both" or "neither"). kinds:
-    the values of a categorical quantity, instead of a range.
+    the values of a categorical quantity, instead of a range. log: whether the colours follow the
+    logarithm of values; those of 0 and below are beyond the lower end.
     """
 
     name: str
@@ -254,11 +294,12 @@ class Scale:
     limits: tuple[float, float]
     beyond: Beyond = "neither"
     kinds: tuple[int, ...] = ()
+    log: bool = False
 
     @property
     def power(self) -> int:
         """The power of ten that a legend factors out of very small and very large numbers."""
-        power = 0 if self.kinds else math.floor(math.log10(max(map(abs, self.limits))))
+        power = 0 if self.kinds or self.log else math.floor(math.log10(max(map(abs, self.limits))))
         return power if power < -2 or power > 3 else 0
 
     @property
@@ -270,8 +311,12 @@ class Scale:
 
     def level(self, values: np.ndarray) -> np.ndarray:
         """The position of values in the range, 0 … 1; NaN stays NaN."""
-        low, high = self.limits
-        return np.clip((np.asarray(values, dtype=float) - low) / (high - low), 0.0, 1.0)
+        values, limits = np.asarray(values, dtype=float), np.asarray(self.limits)
+        if self.log:
+            limits = np.log10(limits)
+            values = np.log10(np.maximum(values, self.limits[0]))  # NaN stays NaN
+        low, high = limits
+        return np.clip((values - low) / (high - low), 0.0, 1.0)
 
     def paint(self, values: np.ndarray) -> np.ndarray:
         """Colours (…, 4) of values."""
@@ -290,7 +335,9 @@ def scale_of(
     label = name if name != style.signal else f"{style.background} outside{note}"
     if name == ANGLE:
         return Scale(name, "angle of the axis", "°", _wheel(), (0.0, 180.0))
-    if given is None and style.channels is None and seen.kinds and name != style.signal:
+    log = style.is_log(name)
+    by_kind = given is None and style.channels is None and not log
+    if by_kind and seen.kinds and name != style.signal:
         return Scale(
             name,
             label,
@@ -300,12 +347,15 @@ def scale_of(
             kinds=tuple(sorted(seen.kinds)),
         )
     low, high = (seen.low, seen.high) if seen.low <= seen.high else (0.0, 1.0)
-    if style.channels is not None and name != style.signal:
+    if log:
+        high, least = (seen.high, seen.least) if seen.high > 0 else (1.0, 0.0)
+        low = max(least, FAINTEST * high)
+    elif style.channels is not None and name != style.signal:
         low = min(0.0, low)  # a dark channel means a value of 0
     limits = given or _wide_enough(low, high, NARROWEST if unit == CONCENTRATION else 0.0)
     under, over = seen.low < limits[0], seen.high > limits[1]
     beyond: Beyond = "both" if under and over else "min" if under else "max" if over else "neither"
-    return Scale(name, label, unit, _colour_map(name, style), limits, beyond)
+    return Scale(name, label, unit, _colour_map(name, style), limits, beyond, log=log)
 
 
 def range_of(name: str) -> ValueRange:

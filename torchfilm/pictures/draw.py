@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from torchfilm.pictures.colours import (
+    ANGLE,
     CELLS,
     MEAN,
     PlotStyle,
@@ -43,19 +44,21 @@ def draw_cells(
     colour: str | None = None,
     channels: Mapping[str, str] | None = None,
     limits: Mapping[str, tuple[float, float]] | None = None,
+    log: bool | str | Sequence[str] = False,
     view: str = "xy",
     window: Window | None = None,
 ) -> list[Scale]:
     """Draw cells, as `Results.frame` gives them; returns their scales, for `colour_bar`.
 
-    colour, channels, limits, view: as for `show`; the default range is that of these cells. window:
-    the range of the axes; default all cells.
+    colour, channels, limits, log, view: as for `show`; the default range is that of these cells.
+    window: the range of the axes; default all cells.
     """
     _check_axes(ax)
     if not isinstance(cells, Mapping):
         hint = "Such as those of one colony: tf.Results(path).frame(-1), or Frame.colony(0)."
         raise checks.input_error("cells", type(cells).__name__, "columns of cells by name", hint)
-    style = PlotStyle(colour=colour, channels=channels, limits=limits, view=view)
+    colour = ANGLE if colour is None and channels is None else colour
+    style = PlotStyle(colour=colour, channels=channels, limits=limits, view=view, log=log)
     scales = []
     for name in style.quantities:
         if channels is None and is_rgb(cells, name):
@@ -104,22 +107,25 @@ def draw_signal(
     view: str = "xy",
     section: float | str = MEAN,
     limits: tuple[float, float] | None = None,
+    log: bool = False,
 ) -> Scale:
     """Draw a signal (nx, ny, nz) of one colony; returns its scale, for `colour_bar`.
 
     values, origin, spacing: as `Results.signal` and `Results.grid` give them. White is lowest and
     black highest. section: where the signal is cut, the coordinate along the line of sight, µm, or
     "mean" for its mean along it. limits: the range from white to black; default the range of the
-    drawn values.
+    drawn values. log: logarithmic colours, as for `show`.
     """
     _check_axes(ax)
     if np.ndim(values) != 3:
         raise checks.input_error("values", f"of shape {np.shape(values)}", "of shape (nx, ny, nz)")
+    checks.choice("log", log, (True, False))
     style = PlotStyle(
         background=name,
         view=view,
         section=section,
         limits=None if limits is None else {name: limits},
+        log=log,
     )
     if section == CELLS:
         raise checks.input_error("section", section, 'a coordinate in µm, or "mean"')
@@ -337,12 +343,16 @@ def colour_bar(ax: Axes, scale: Scale) -> None:
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colorbar import Colorbar
-    from matplotlib.colors import BoundaryNorm, Normalize
+    from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
 
     if scale.kinds:
         count = len(scale.kinds)
         norm: Any = BoundaryNorm(np.arange(count + 1) - 0.5, count)
         ticks, words = np.arange(count), [str(k) for k in scale.kinds]
+    elif scale.log:
+        low, high = scale.limits
+        norm, ticks = LogNorm(low, high), np.array([low, math.sqrt(low * high), high])
+        words = [f"{x:.3g}" for x in ticks]
     else:
         low, high = scale.limits
         norm, ticks = Normalize(low, high), np.array([low, 0.5 * (low + high), high])

@@ -38,6 +38,7 @@ def show(
     channels: Mapping[str, str] | None = None,
     background: str | None = None,
     limits: Limits | None = None,
+    log: bool | str | Sequence[str] = False,
     view: str = "xy",
     section: float | str = CELLS,
     whole: bool = False,
@@ -66,7 +67,10 @@ def show(
 
     limits: the range of colours by name of a drawn quantity, such as {"yfp": (0, 2)}. A signal with
     the name of a quantity of the cells is "out.NAME". The default is the range of all that is drawn
-    in the picture (from 0 for a channel; over the whole box for a signal).
+    in the picture (from 0 for a channel; over the whole box for a signal). log: colours that follow
+    logarithms, as of a signal that falls tenfold every few micrometres: True for all drawn
+    quantities, or their names. Their default range reaches down to a ten-thousandth of the highest
+    value; lower ones have the lowest colour, and a pointed end of the colour bar says so.
 
     view: "xy", "xz" or "yz". section: where a signal in three dimensions is cut: at the height of
     the "cells" (their mean in each colony, the values that they read), its "mean" along the line of
@@ -82,7 +86,7 @@ def show(
         raise checks.input_error("values", values, rule)
     if values and colour is None and channels is None:
         colour = next(iter(values))
-    style = PlotStyle(colour, channels, background, limits, view, section, whole)
+    style = PlotStyle(colour, channels, background, limits, view, section, whole, log)
     if isinstance(what, (State, Frame)):
         shown, heading = _with(values, _given_frame(what, scene, frame)), name_of(scene)
     elif values:
@@ -187,6 +191,7 @@ def strip(
     channels: Mapping[str, str] | None = None,
     background: str | None = None,
     limits: Limits | None = None,
+    log: bool | str | Sequence[str] = False,
     view: str = "xy",
     section: float | str = CELLS,
     whole: bool = False,
@@ -203,7 +208,7 @@ def strip(
     The other options are those of `show`.
     """
     figure_class()
-    style = PlotStyle(colour, channels, background, limits, view, section, whole)
+    style = PlotStyle(colour, channels, background, limits, view, section, whole, log)
     with opened(what) as results:
         check_not_results(results.path, out)
         chosen = choose_frames(results.times, times, count)

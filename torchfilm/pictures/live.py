@@ -48,6 +48,7 @@ class LivePlot(metaclass=checks.KnownKeywords):
         channels: Mapping[str, str] | None = None,
         background: str | None = None,
         limits: Limits | None = None,
+        log: bool | str | Sequence[str] = False,
         view: str = "xy",
         section: float | str = CELLS,
         whole: bool = False,
@@ -56,7 +57,7 @@ class LivePlot(metaclass=checks.KnownKeywords):
         dpi: float = 150,
     ):
         figure_class()
-        self.style = PlotStyle(colour, channels, background, limits, view, section, whole)
+        self.style = PlotStyle(colour, channels, background, limits, view, section, whole, log)
         self.seconds = checks.number("LivePlot.seconds", seconds, least=0.0)
         self.notebook = in_notebook()
         if out is None and not self.notebook:

@@ -48,6 +48,7 @@ def movie(
     channels: Mapping[str, str] | None = None,
     background: str | None = None,
     limits: Limits | None = None,
+    log: bool | str | Sequence[str] = False,
     view: str = "xy",
     section: float | str = CELLS,
     whole: bool = False,
@@ -67,7 +68,7 @@ def movie(
     target = Path(out)
     write = _writer(target, fps)
     checks.integer("every", every, least=1)
-    style = PlotStyle(colour, channels, background, limits, view, section, whole)
+    style = PlotStyle(colour, channels, background, limits, view, section, whole, log)
     with opened(what) as results:
         check_not_results(results.path, out)
         last = len(results) - 1

@@ -13,7 +13,7 @@ from torchfilm.io.blocks import blocks
 from torchfilm.io.identity import declared_fields
 from torchfilm.io.results import Results
 from torchfilm.physics import capsule
-from torchfilm.pictures.colours import checked_range
+from torchfilm.pictures.colours import PlotStyle, ValueRange, checked_range, scale_of
 from torchfilm.pictures.figures import check_not_results, opened
 from torchfilm.pictures.page import checked_dpi
 from torchfilm.pictures.picture import Picture, new_figure
@@ -38,6 +38,7 @@ def kymograph(
     edges: Sequence[float] | None = None,
     colony: int | None = None,
     limits: tuple[float, float] | None = None,
+    log: bool = False,
     out: str | Path | None = None,
     dpi: float = 160,
 ) -> Picture:
@@ -48,12 +49,17 @@ def kymograph(
     what: a results file, or its path. quantity: a field of the cells, or a signal at them as
     "out.NAME". along: "x", "y", "z", or "radius" from the colony's centre. edges: of the bins, µm,
     ascending; default bins of 1 µm where there are cells. colony: its id; default the first.
-    limits: the range of colours; default that of the means. out: save the picture there."""
+    limits: the range of colours; default that of the means. log: logarithmic colours, as for
+    `show`. out: save the picture there."""
+    from matplotlib.colors import LogNorm, Normalize
+
     with opened(what) as results:
         check_not_results(results.path, out)
         checks.choice("along", along, ALONG[: int(results.attributes["dim"])] + ALONG[3:])
         checked_dpi(dpi)
-        low, high = (None, None) if limits is None else checked_range("limits", limits)
+        checks.choice("log", log, (True, False))
+        given = None if limits is None else {quantity: checked_range("limits", limits)}
+        style = PlotStyle(colour=quantity, limits=given, log=log)
         if len(results) < 2:
             raise checks.InputError(f"a kymograph needs two frames, and {results.path} has one")
         ids = results.colony_id.tolist()
@@ -73,20 +79,22 @@ def kymograph(
         groups = Groups(torch.from_numpy(frame), len(seen), ordered=True)
         value, place = torch.from_numpy(values), torch.from_numpy(places)
         grid = binned_mean(groups, value, place, bins.tolist()).numpy()
+        unit, drawn = unit_at_cells(results, quantity), ValueRange()
+        drawn.add(grid)
+        scale = scale_of(quantity, drawn, style, {quantity: unit})
+        norm = LogNorm(*scale.limits) if log else Normalize(*scale.limits)
         figure = new_figure(5.0, 4.0, dpi)
         ax = figure.add_subplot()
-        # as in other pictures, whatever the style
-        mesh = ax.pcolormesh(
-            bins, _between(results.times), grid, vmin=low, vmax=high, cmap="viridis"
-        )
+        # as in other pictures, whatever the style; a mean of 0 has the lowest colour, NaN has none
+        filled = np.maximum(grid, scale.limits[0]) if log else grid
+        mesh = ax.pcolormesh(bins, _between(results.times), filled, norm=norm, cmap="viridis")
         ax.grid(False)
         ax.invert_yaxis()
         where = "distance from the centre" if along == "radius" else along
         ax.set(xlabel=f"{where} (µm)", ylabel="time (h)")
         title = f"{quantity}, colony {chosen}" if len(ids) > 1 else quantity
         ax.set_title(title, parse_math=False)
-        unit = unit_at_cells(results, quantity)
-        bar = figure.colorbar(mesh)
+        bar = figure.colorbar(mesh, extend=scale.beyond)
         bar.set_label(f"mean of {quantity}" + f" ({unit})" * bool(unit), parse_math=False)
         return Picture(figure, out)
 

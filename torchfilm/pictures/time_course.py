@@ -37,6 +37,7 @@ def time_course(
     by: str | None = None,
     colonies: Sequence[int] | None = None,
     most: int = 8,
+    log: bool = False,
     out: str | Path | None = None,
     dpi: float = 160,
 ) -> Picture:
@@ -48,11 +49,13 @@ def time_course(
     what: a results file, or its path. quantities: fields of the cells, or signals at them as
     "out.NAME". by: a field of whole numbers, such as "cell_type": cells of each are counted apart,
     a colour for each, and a style of lines for each of up to four colonies. colonies: their ids;
-    default the first `most` that had cells. out: save the picture there. Raises InputError for a
-    quantity that is not recorded, and for a file of one frame."""
+    default the first `most` that had cells. log: logarithmic axes of the quantities; the number of
+    cells has one where it grows more than tenfold. out: save the picture there. Raises InputError
+    for a quantity that is not recorded, and for a file of one frame."""
     with opened(what) as results:
         check_not_results(results.path, out)
         checked_dpi(dpi)
+        checks.choice("log", log, (True, False))
         if len(results) < 2:
             raise checks.InputError(f"a time course needs two frames, and {results.path} has one")
         frames = RecordedFrames(results, range(len(results)))
@@ -80,7 +83,7 @@ def time_course(
         _finish(axes[0], "cells", log=bool(counts.max(initial=0.0) > TENFOLD * max(1, some)))
         for row, name in enumerate(quantities):
             unit = unit_at_cells(results, name)
-            _finish(axes[1 + row], f"mean of {name}" + f" ({unit})" * bool(unit))
+            _finish(axes[1 + row], f"mean of {name}" + f" ({unit})" * bool(unit), log)
         axes[-1].set_xlabel("time (h)")
         if len(results.colony_id) > 1 or by is not None:
             axes[0].legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
