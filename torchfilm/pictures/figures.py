@@ -67,10 +67,9 @@ def show(
 
     limits: the range of colours by name of a drawn quantity, such as {"yfp": (0, 2)}. A signal with
     the name of a quantity of the cells is "out.NAME". The default is the range of all that is drawn
-    in the picture (from 0 for a channel; over the whole box for a signal). log: colours that follow
-    logarithms, as of a signal that falls tenfold every few micrometres: True for all drawn
-    quantities, or their names. Their default range reaches down to a ten-thousandth of the highest
-    value; lower ones have the lowest colour, and a pointed end of the colour bar says so.
+    in the picture (from 0 for a channel; over the whole box for a signal). log: True for
+    logarithmic colours, or the names of their quantities. The default range goes down to a
+    ten-thousandth of the highest value; a pointed end of the bar says where values are lower.
 
     view: "xy", "xz" or "yz". section: where a signal in three dimensions is cut: at the height of
     the "cells" (their mean in each colony, the values that they read), its "mean" along the line of

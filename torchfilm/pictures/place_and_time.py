@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from torchfilm.io.blocks import blocks
 from torchfilm.io.identity import declared_fields
 from torchfilm.io.results import Results
 from torchfilm.physics import capsule
-from torchfilm.pictures.colours import PlotStyle, ValueRange, checked_range, scale_of
+from torchfilm.pictures.colours import PlotStyle, Scale, ValueRange, checked_range, scale_of
 from torchfilm.pictures.figures import check_not_results, opened
 from torchfilm.pictures.page import checked_dpi
 from torchfilm.pictures.picture import Picture, new_figure
@@ -51,8 +52,6 @@ def kymograph(
     ascending; default bins of 1 µm where there are cells. colony: its id; default the first.
     limits: the range of colours; default that of the means. log: logarithmic colours, as for
     `show`. out: save the picture there."""
-    from matplotlib.colors import LogNorm, Normalize
-
     with opened(what) as results:
         check_not_results(results.path, out)
         checks.choice("along", along, ALONG[: int(results.attributes["dim"])] + ALONG[3:])
@@ -82,12 +81,9 @@ def kymograph(
         unit, drawn = unit_at_cells(results, quantity), ValueRange()
         drawn.add(grid)
         scale = scale_of(quantity, drawn, style, {quantity: unit})
-        norm = LogNorm(*scale.limits) if log else Normalize(*scale.limits)
         figure = new_figure(5.0, 4.0, dpi)
         ax = figure.add_subplot()
-        # as in other pictures, whatever the style; a mean of 0 has the lowest colour, NaN has none
-        filled = np.maximum(grid, scale.limits[0]) if log else grid
-        mesh = ax.pcolormesh(bins, _between(results.times), filled, norm=norm, cmap="viridis")
+        mesh = _draw(ax, bins, _between(results.times), grid, scale)
         ax.grid(False)
         ax.invert_yaxis()
         where = "distance from the centre" if along == "radius" else along
@@ -97,6 +93,16 @@ def kymograph(
         bar = figure.colorbar(mesh, extend=scale.beyond)
         bar.set_label(f"mean of {quantity}" + f" ({unit})" * bool(unit), parse_math=False)
         return Picture(figure, out)
+
+
+def _draw(ax: Any, bins: np.ndarray, times: np.ndarray, grid: np.ndarray, scale: Scale) -> Any:
+    """Draw means (frames, bins) between these edges, as in other pictures whatever the style. What
+    is below a logarithmic scale has its lowest colour; NaN has none."""
+    from matplotlib.colors import LogNorm, Normalize
+
+    norm = LogNorm(*scale.limits) if scale.log else Normalize(*scale.limits)
+    filled = np.maximum(grid, scale.limits[0]) if scale.log else grid
+    return ax.pcolormesh(bins, times, filled, norm=norm, cmap="viridis")
 
 
 def _between(times: np.ndarray) -> np.ndarray:
