@@ -116,6 +116,7 @@ def test_tiny_fractions_are_refused_in_words(fraction):
 @pytest.mark.parametrize("by_torch", [False, True])
 def test_who_is_too_short_does_not_depend_on_the_others(by_torch, monkeypatch):
     """A cell of exactly the length that it needs, in float32, beside one that is far too short."""
+    pytest.importorskip("numba")  # kernels divide where it has been loaded
     if by_torch:
         monkeypatch.setattr("torchfilm.effects.division.knows_due", lambda *_: False)
     fraction, radius = 0.935, torch.tensor(0.37)
@@ -135,6 +136,7 @@ def test_a_cell_too_short_for_its_shorter_daughter_fails_its_colony(
 ):
     """Of cells of 3.9 and 4.1 µm: with a share of a fifth the former would have a daughter of
     −0.02 µm."""
+    pytest.importorskip("numba")  # kernels divide where it has been loaded
     if by_torch:
         monkeypatch.setattr("torchfilm.effects.division.knows_due", lambda *_: False)
     scene = tf.Scene(tf.Division(fraction=fraction), founders=row_of_cells(1, 3.9))
@@ -204,6 +206,20 @@ def test_a_cell_too_short_to_divide_keeps_its_whole_colony_from_dividing():
         "no division of no cell for a rule to see"
     )
     assert "division" not in step(scene, flagged(scene, 3, which=[0]), 0.1).reports
+
+
+@pytest.mark.parametrize("by_torch", [False, True])
+def test_a_wide_cell_needs_the_length_of_its_own_caps(by_torch, monkeypatch):
+    """Radii are seldom 1 µm: a cell of 3 µm divides with a radius of 0.5 µm, not with one of 2."""
+    pytest.importorskip("numba")  # kernels divide where it has been loaded
+    if by_torch:
+        monkeypatch.setattr("torchfilm.effects.division.knows_due", lambda *_: False)
+    scene = tf.Scene(tf.Division(), founders=row_of_cells(1, 3.0))
+    state = flagged(scene, 2)
+    after = step(scene, state.replace(radius=state.radius * torch.tensor([1.0, 4.0])), 0.1)
+    assert after.counts.tolist() == [2, 1]
+    report = after.reports["division"]
+    assert report.status.tolist() == [0, 1] and float(report.needs[1]) == 4.0
 
 
 def test_exactly_two_radii_may_divide():

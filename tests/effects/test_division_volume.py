@@ -14,6 +14,7 @@ F64 = torch.float64
 
 def divided(dim: int, fraction: float, by_torch: bool, monkeypatch, **given):
     """A cell and its two daughters."""
+    pytest.importorskip("numba")  # kernels divide where it has been loaded
     if by_torch:
         monkeypatch.setattr("torchfilm.effects.division.can_divide", lambda *_: False)
     place, axis = [1.0, 2.0, 0.0][:dim], [0.6, 0.8, 0.0][:dim]
@@ -69,6 +70,7 @@ def test_another_word_is_refused():
 @pytest.mark.parametrize("by_torch", [False, True])
 def test_a_cell_may_be_as_short_as_its_volume_allows(by_torch, monkeypatch):
     """Two balls of radius 0.4 hold as much as a cell of 4/3 · 0.4 µm: far less than two radii."""
+    pytest.importorskip("numba")  # kernels divide where it has been loaded
     if by_torch:
         monkeypatch.setattr("torchfilm.effects.division.knows_due", lambda *_: False)
     division = tf.Division(conserves="volume", axis_noise=0.0)

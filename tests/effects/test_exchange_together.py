@@ -179,6 +179,24 @@ def test_a_circuit_that_only_reads_finds_the_signal_half_way():
     assert (ends[0] - ends[2]).abs().max() > 3 * (ends[1] - ends[2]).abs().max() > 1e-9
 
 
+@pytest.mark.parametrize("exchange", ["together", "turns"])
+@pytest.mark.parametrize("backend", [None, "torch"])
+def test_what_two_circuits_give_adds_up(exchange, backend):
+    """The medium gains what both lose, whichever comes first."""
+    A, B = (
+        exchanging(first, D1=speed, name=name, backend=backend)
+        for name, first, speed in (("A", 3.0, 1.0), ("B", 5.0, 2.0))
+    )
+    made = tf.Scene(A, B, medium(decay=0.0, exchange=exchange, backend=backend), founders=SIX)
+    start = made.bind(dtype=F64).start()
+    end = advance(made, start, 2, DT)
+    gave = [
+        float(((start.fields[n] - end.fields[n]) * end.volume).sum()) for n in ("A_ahl", "B_ahl")
+    ]
+    assert gave[1] > gave[0] > 1.0
+    assert float(totals(end, inside=False)) == pytest.approx(sum(gave), rel=1e-9)
+
+
 def test_cells_in_a_reservoir_and_signals_without_cells():
     """What cells beyond the box give goes to the reservoir; colonies without cells diffuse."""
     made = resting(
@@ -332,14 +350,16 @@ def test_a_gradient_passes_to_a_circuit_that_only_reads():
 
 
 @pytest.mark.parametrize("backend", [None, "torch"])
-def test_derivatives_by_an_exchange_that_is_0(backend):
-    """Nothing is given or taken."""
+@pytest.mark.parametrize("initial", [1.0, 0.0])
+@pytest.mark.parametrize("exchange", ["together", "turns"])
+def test_derivatives_by_an_exchange_that_is_0(backend, initial, exchange):
+    """Nothing is given or taken; and where there is nothing to take, cells would still give."""
 
     def field(D1):
         circuit = tf.Circuit(
             lux, species="ahl", initial={"ahl": 2.0}, D1=D1, gain=0.0, backend=backend, **TIGHT
         )
-        made = resting(medium(initial=1.0), circuit, SIX)
+        made = resting(medium(initial=initial, exchange=exchange), circuit, SIX)
         return advance(made, made.bind(dtype=F64).start(), 1, DT).signals["ahl"].sum()
 
     at = torch.tensor(0.0, dtype=F64, requires_grad=True)
@@ -348,6 +368,7 @@ def test_derivatives_by_an_exchange_that_is_0(backend):
     with forward_mode():
         forward = tangent(field(with_tangent(zero, one)))
     slope = float(field(torch.tensor(1e-6, dtype=F64)) - field(zero)) / 1e-6
+    assert slope > 0.01
     assert float(at.grad) == pytest.approx(slope, rel=1e-4)
     assert float(forward) == pytest.approx(slope, rel=1e-4)
 

@@ -171,14 +171,15 @@ def gives(u, s, p, cell):
     return {"gfp": 0.0 * u.gfp}, {"m": 5.0 + 0.0 * s.m}
 
 
-@pytest.mark.parametrize("exchange", ["together", "turns"])
-def test_voxels_beyond_what_cells_give_are_as_without_cells(exchange):
-    """Beside cells that give the signal, the corners of the box, far from all cells, decay."""
+@pytest.mark.parametrize(("exchange", "steps"), [("together", 1), ("turns", 1), ("turns", 4)])
+def test_voxels_beyond_what_cells_give_are_as_without_cells(exchange, steps):
+    """Beside cells that give the signal, the corners of the box, far from all cells, decay; in as
+    much of a step as the others had before the box grew, half of a turn."""
     scene = tf.Scene(
         *GROWING, tf.Circuit(gives, species="gfp"),
         tf.Medium(
             m=tf.Signal(0.01, initial=1.0, decay=1.0), box=((-4, -4), (4, 4)), spacing=2.0,
-            outside="grow", margin=12.0, exchange=exchange,
+            outside="grow", margin=12.0, exchange=exchange, steps=steps,
         ),
         dt=0.05,
     )  # fmt: skip

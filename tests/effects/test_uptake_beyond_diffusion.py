@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import torchfilm as tf
+from torchfilm.together import profile
 from torchfilm.tools.tangents import forward_mode, tangent, with_tangent
 
 DIFFUSION, OUTSIDE, WIDTH, HEIGHT = 100.0, 1.0, 8.0, 20.0
@@ -25,7 +26,7 @@ def scene(K, q, dt, diffusion=DIFFUSION, **options):
     faces = tf.BoundaryConditions(x=tf.Periodic(), y=(tf.NoFlux(), tf.Dirichlet(OUTSIDE)))
     medium = tf.Medium(
         o2=tf.Signal(diffusion=diffusion, initial=OUTSIDE), spacing=1.0, depth=1.0,
-        box=((0, 0), (WIDTH, HEIGHT)), boundary=faces,
+        box=((0, 0), (WIDTH, HEIGHT)), boundary=faces, backend=options.get("backend"),
     )  # fmt: skip
     row = tf.Cells([[x, 0.5] for x in (1, 3, 5, 7)], [[1.0, 0.0]] * 4, length=1.0)
     circuit = tf.Circuit(eats, species="used", K=K, q=q, **options)
@@ -152,3 +153,16 @@ def test_scarce_signals_that_cells_cross_linearly_need_no_parts():
     )  # fmt: skip
     counts = [int(s.reports["circuit"].iterations[0]) for s in tf.simulate(made, until=20.0)]
     assert max(counts[1:]) <= 8
+
+
+@pytest.mark.parametrize("dt", [0.05, 1 / 3])
+def test_a_signal_that_is_used_up_within_a_step_does_not_go_below_0(dt, dtype):
+    """The line along which cells find it, by the arithmetic of a circuit's steps: a rate may take
+    its root."""
+    mean = torch.rand(1000, 1, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    begin, middle, slope = profile(torch.cat([0.0 * mean, mean], 1), dt, dtype)
+    close = {"rtol": 1e-5, "atol": 0.0}
+    torch.testing.assert_close(begin, 2.0 * mean[:, 0].to(dtype), **close)
+    torch.testing.assert_close(middle, mean[:, 0].to(dtype), **close)
+    end = begin + slope * dt
+    assert bool((end >= 0).all()) and bool((end <= 1e-5 * begin).all())

@@ -131,6 +131,19 @@ def test_a_solve_is_that_of_torch(dtype, shape, faces, kind, masked):
     assert float((one - other).abs().max()) <= allowed
 
 
+@pytest.mark.parametrize("kind", ["still", "uniform"])
+def test_a_solve_of_next_to_nothing_is_that_of_more(kind):
+    """Squares of what is left may lie below all numbers. It is solved for as if it were more, and
+    all of the solution is that of less again, also its last correction by the residual."""
+    op, *_ = operator_of((7, 6, 5), "closed", kind, source=None)
+    stepper = prepare(op, 3.0 * MOST / float(op.loss.max()), "series")
+    assert bool(stepper.far.all())
+    u = torch.rand(1, 7, 6, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    for run in (stepper.step, lambda x: by_kernel(stepper, x)):
+        much, less = run(u), run(u * 2.0**-500) * 2.0**500
+        assert float((much - less).abs().max()) <= 4e-10 * float(u.norm())
+
+
 def test_a_solve_that_fails_is_its_own_colonys():
     op = build_operator((4, 3, 1), (1.0,) * 3, diffusion=1e4, colonies=2, dtype=torch.float64)
     stepper, u = prepare(op, 1.0, "series"), torch.ones(2, 4, 3, 1, dtype=torch.float64)

@@ -144,6 +144,18 @@ def test_a_cell_alone_may_empty_its_voxel_and_a_crowd_shares(device, dtype):
     assert float(emptied.min()) == pytest.approx(0.0, abs=1e-6) and float(emptied.min()) >= 0.0
 
 
+@pytest.mark.parametrize("by_torch", [False, True])
+def test_a_crowd_beside_it_does_not_share_with_a_cell_at_a_face(by_torch, monkeypatch):
+    """Within half a voxel of the faces the outermost voxel alone counts, though the stencil has the
+    next ones, too, with weights of 0."""
+    if by_torch:
+        monkeypatch.setattr(compiled, "may_run", lambda *_: False)
+    g = grid([(5, 4, 6)])
+    place = torch.cat([g.centres()[:1] - 0.1, g.centres()[24:25].expand(9, 3)])  # next along x
+    pool = pool_volume(stencil(g, place, torch.zeros(10, dtype=torch.int64)))
+    assert pool.tolist() == pytest.approx([g.voxel_volume] + [g.voxel_volume / 9] * 9)
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 2**31),

@@ -434,3 +434,20 @@ def test_a_mean_operator_has_the_mean_rates(faces, kinds, masked):
             for found, rate in zip(among, rates, strict=True):
                 assert masked or torch.equal(found.flatten()[:1], rate.flatten()[:1])
     assert mean([(1.0, one)]) is one
+
+
+def test_where_nothing_is_beyond_a_face_the_mean_has_less_enter():
+    """As where a flow becomes faster while what it brings begins, within one step: a part without
+    anything beyond its faces counts with its share, though it has no value there."""
+    shape, u = (5, 4, 3), torch.zeros(1, 5, 4, 3, dtype=torch.float64)
+    made = lambda speed, value: build_operator(
+        shape, SPACING, diffusion=1.3, velocity=(speed, -speed, 0.0), dtype=torch.float64,
+        boundary=BoundaryConditions(x=(Dirichlet(value), Open(value)), y=(Open(), Open(value))),
+    )  # fmt: skip
+    empty, full = made(3.0, 0.0), made(2.0, 0.7)
+    assert empty.axes[0].low is None and full.axes[0].low is not None
+    for order in ((empty, full), (full, empty)):
+        parts = list(zip((0.25, 0.75), order, strict=True))
+        expected = sum(share * apply(op, u) for share, op in parts)
+        assert float(expected.max()) > 0.1
+        torch.testing.assert_close(apply(mean(parts), u), expected, rtol=1e-13, atol=1e-13)

@@ -167,6 +167,27 @@ def test_tangents_of_a_step_with_cells(faces):
         assert float(slope.abs().max()) > 0.1
 
 
+@FACES
+def test_tangents_of_what_is_neither_given_nor_taken(faces):
+    """By kernels as by torch: half of a change is given and half is not taken, but all of it is
+    given by a cell that expects nothing to take."""
+    slopes, given = [], []
+    for compiled in (True, False):
+        made = Scene(faces, MIXED, compiled)
+        released, mean = made.guesses()
+        released, mean = 0.0 * released, torch.where(torch.arange(len(mean)) % 2 == 0, 0.0, mean)
+        turn = torch.as_tensor(made.rng.uniform(0.5, 1.5, len(mean)))
+        with forward_mode():
+            found = made.joint().moved(with_tangent(released, turn), mean)
+            slopes.append([tangent(x) for x in found])
+        nothing = made.fed & (mean == 0)
+        given.append(slopes[-1][3][nothing])
+    for one, other in zip(*slopes, strict=True):
+        close(one, other, 1e-7)
+        assert float(one.abs().max()) > 1e-3
+    assert len(given[0]) > 3 and bool((given[0] == 0).all())
+
+
 @BACKENDS
 @FACES
 def test_uptake_solves_its_equation(faces, compiled):

@@ -163,6 +163,8 @@ def write_moved(
         # halves of |amount| ± amount: at 0 the derivatives of both then add up to 1
         wanted, less = half * (abs(a) - a), half * (sign * turned[i] - turned[i])
         more = half * (sign * turned[i] + turned[i]) / volume
+        if a == 0 and not there[i] > 0:  # where there is nothing to take all of it is given
+            less, more = a, turned[i] / volume
         if there[i] > 0:
             content = there[i] * volume
             part = wanted / content

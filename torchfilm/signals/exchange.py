@@ -267,8 +267,11 @@ def write(values: Tensor, amount: Tensor, stencil: Stencil, there: Tensor | None
         return compiled.write_with_tangent(values, amount, there, stencil, ULPS)
     weight = stencil.weight.to(values.dtype)
     volume = stencil.voxel_volume
-    # halves of amount ± |amount|: at 0 the derivatives of both then add up to 1
-    wanted, added = 0.5 * (amount.abs() - amount), 0.5 * (amount.abs() + amount)
+    # halves of amount ± |amount|: at 0 the derivatives of both then add up to 1; but where there is
+    # nothing to take all of it is given
+    none = 0.5 * torch.where((amount == 0) & (there <= 0), amount, 0.0)
+    wanted = 0.5 * (amount.abs() - amount) + none
+    added = 0.5 * (amount.abs() + amount) + none
     # the part of a voxel's content that a cell takes if all its weight is there
     part = wanted / (torch.where(there > 0, there, 1.0) * volume)
     part = torch.where((wanted > 0) & (there <= 0), torch.inf, part)

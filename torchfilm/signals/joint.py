@@ -167,7 +167,9 @@ class JointTransport:
         """
         wanted = -_parted(torch.where(self.fed, released.double(), 0.0), moved.mean)[1]
         left, there = wanted + moved.taken, read(moved.end, self.stencil)
-        here = torch.maximum(left, -0.5 * there * self.pool)
+        most = -0.5 * there * self.pool
+        # not maximum, whose derivative is the mean of both where they are equal, as where all is 0
+        here = torch.where(left < most, most, left)
         end, missing = write(moved.end, here, self.stencil, there), here - left
         if not bool((missing > 0).any()):
             return end, missing.new_zeros(self.groups.size), left
