@@ -40,8 +40,10 @@ def softness(measure: str, state: State) -> Tensor:
             f"{measure}: the state does not say in which steps its contacts were solved."
             " Give it as a step returns it: not a first one, nor one from a file or by select."
         )
-    steps = state.groups.spread(report.substeps.clamp(min=1))
-    return state.contact_alpha.double() * report.dt / steps
+    steps, solved = (state.groups.spread(x) for x in (report.substeps.clamp(min=1), report.alpha))
+    # the field is for the next step, which follows the force; where α is given it is that
+    alpha = torch.where(solved > 0, solved, state.contact_alpha.double())
+    return alpha * report.dt / steps
 
 
 @dataclass(frozen=True)

@@ -250,7 +250,7 @@ class Mechanics(Effect):
         collapsed = Field("collapsed_steps", meaning, dtype=torch.int64, internal=True)
         if not self.one_sided:
             return move, collapsed
-        meaning = "α of the colony's contacts in the last step, 0 before the first"
+        meaning = "α with which the next step of the colony's contacts begins, 0 before the first"
         alpha = Field("contact_alpha", meaning, "1/μ/µm", internal=True)
         meaning = "how much shorter pressure has made a cell than it once was"
         compression = Field("compression", meaning, "µm", at_division="reset", internal=True)

@@ -41,8 +41,8 @@ from torchfilm.kernels.scheme import (
 )
 
 # Places in the report of a colony.
-ITERATIONS, PASSES, ERROR, CLIPPED, DEEPLY, STATUS, SUBSTEPS = range(7)
-REPORT = 7
+ITERATIONS, PASSES, ERROR, CLIPPED, DEEPLY, STATUS, SUBSTEPS, ALPHA = range(8)
+REPORT = 8
 # How α is given.
 NOT_GIVEN, GIVEN, OF_STIFFNESS = range(3)
 

@@ -18,6 +18,7 @@ from torchfilm.kernels.bonds import (
     room_of_bonds,
 )
 from torchfilm.kernels.colonies import (
+    ALPHA,
     CLIPPED,
     DEEPLY,
     ERROR,
@@ -247,8 +248,8 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
         if not _noted(report, error, tolerance):
             break
         if error <= tolerance and number == 0 and not given:
-            before = hardness[0]
-            hardness[0] = kept_alpha if failed else _following(e, rows[4], before, target, limits)
+            report[ALPHA] = before = kept_alpha if failed else hardness[0]  # of this solve
+            hardness[0] = before if failed else _following(e, rows[4], before, target, limits)
             if hardness[0] < LAG * before and not failed:  # the force has grown: solve again
                 put(y, kept)
                 held, kept_alpha, rising = error, before, False
@@ -390,8 +391,7 @@ def _mean(values):
 def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, alphas, given,
                   walls, settings, out, reports, dof):  # fmt: skip
     """Steps of the colonies `which`, each by itself: `kernels.colonies` describes the arguments.
-    team: a board of threads that assist, or (0,). given: as in
-    `kernels.bonds`."""
+    team: a board of threads that assist, or (0,). given: as in `kernels.bonds`."""
     x, radius, contact_alpha = cells[0], cells[4], cells[7]
     kinds, places, sizes, _, is_soft = walls
     while True:

@@ -113,10 +113,11 @@ def pressure(state: State, scene: Scene) -> Tensor:
     the cell's centre along the force, over d times the cell's volume; in a strictly two-dimensional
     scene d = 2 and its area as seen from above, μ·µm/h, else d = 3, μ/h. Cells carry what the gaps
     between them do not: in a full chamber the mean, weighted by size, is the pressure on the walls
-    over the share of the chamber that the cells fill. Overlaps give the forces with an error of
-    second order in dt, since cells grow and are pushed back within a step: in a full chamber they
-    are 3 to 5 % too small at 0.025 h, 0.5 % at 0.00625 h. Adhesion pulls: where it does so more
-    than contacts push, the pressure is below 0. Bonds that broke in this step do not count.
+    over the share of the chamber that the cells fill. Overlaps give the forces with an error that
+    falls with dt, since cells grow, are pushed back and slide past one another within a step: in a
+    full chamber they are 3 to 5 % too small at 0.025 h, 0.5 % at 0.00625 h; in a colony that
+    expands 10 to 16 % and 2 to 5 %. Adhesion pulls: where it does so more than contacts push, the
+    pressure is below 0. Bonds that broke in this step do not count.
 
     Raises InputError for bilateral contacts, and for a state that is not as a step returned it: it
     lacks the step and the number of sub-steps.

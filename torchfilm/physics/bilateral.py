@@ -36,8 +36,9 @@ def contact_steps(given: StepInput[ContactSettings]) -> StepResult:
     )
     none = torch.zeros_like(groups.counts)
     report = ContactReport(
-        none, none, torch.zeros_like(none, dtype=given.length.dtype), none, none, none
-    )
+        none, none, torch.zeros_like(none, dtype=given.length.dtype), none, none, none,
+        torch.zeros_like(given.hardness),
+    )  # fmt: skip
     clipped = torch.zeros_like(groups.owner, dtype=torch.bool)
     reach = torch.zeros_like(given.radius)
     at = Moved(given.position, given.axis, given.length, clipped, reach, given.start)
@@ -48,7 +49,7 @@ def contact_steps(given: StepInput[ContactSettings]) -> StepResult:
     return StepResult(
         at.position, at.axis, at.length, at.first_move, given.hardness, report.status,
         report.iterations, report.residual.double(), report.passes, report.clipped,
-        report.deeply_overlapping,
+        report.deeply_overlapping, report.alpha,
     )  # fmt: skip
 
 

@@ -67,12 +67,12 @@ def step(
         else:
             share_among_threads(step_colonies, every, counts, arguments)
     _called.add(kind)
-    residual = torch.from_numpy(reports[:, kernels.ERROR].copy())
+    residual, used = torch.from_numpy(reports.T[[kernels.ERROR, kernels.ALPHA]]).unbind()
     reports[:, kernels.ERROR] = 0  # may be no number; the others are integers
     whole = torch.from_numpy(reports.T.astype(np.int64)).unbind()
     report = ContactReport(
         whole[kernels.STATUS], whole[kernels.ITERATIONS], residual, whole[kernels.PASSES],
-        whole[kernels.CLIPPED], whole[kernels.DEEPLY],
+        whole[kernels.CLIPPED], whole[kernels.DEEPLY], used,
     )  # fmt: skip
     return out, report, whole[kernels.SUBSTEPS]
 

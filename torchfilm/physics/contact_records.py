@@ -111,7 +111,8 @@ class ContactReport:
     """What the contact solves of a step did, per colony (B,). `status` of the worst solve,
     `iterations` of CG in all, and the worst true `residual`; `passes` taken; `clipped`: cells whose
     last move was cut short; `deeply_overlapping`: cells that were deeper in another than a radius
-    when the step, or its last sub-step, began (0 of soft cells, which may be).
+    when the step, or its last sub-step, began (0 of soft cells, which may be); `alpha` (float64): α
+    of the first pass, of the last sub-step; 0 of bilateral contacts and where α is given.
     """
 
     status: Tensor
@@ -120,6 +121,7 @@ class ContactReport:
     passes: Tensor
     clipped: Tensor
     deeply_overlapping: Tensor
+    alpha: Tensor
 
     def with_solve(self, new: SolveReport, clipped: Tensor, active: Tensor) -> ContactReport:
         """The report after one more pass in the colonies that are active, (B,) bool."""
@@ -130,4 +132,5 @@ class ContactReport:
             self.passes + active,
             torch.where(active, clipped, self.clipped),
             self.deeply_overlapping,
+            self.alpha,
         )

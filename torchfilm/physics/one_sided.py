@@ -59,6 +59,7 @@ def contact_steps(given: StepInput) -> StepResult:
     at = StepResult(
         given.position, given.axis, given.length, given.start, given.hardness,
         none, none, torch.zeros_like(given.hardness), none, none, none,
+        torch.zeros_like(given.hardness),
     )  # fmt: skip
     growth = given.growth / steps.clamp(min=1).index_select(0, given.groups.owner)
     share = 1.0 / steps.double()
@@ -242,7 +243,8 @@ class _OneStep:
             followed = self._followed(solved.hardness, part, after, contacts, walls)
             followed = torch.where(solved.fell, solved.hardness, followed)
             good = sound & (end.error <= settings.tolerance)
-            at = replace(at, hardness=torch.where(good, followed, at.hardness))
+            used = torch.where(good, solved.hardness.detach(), at.alpha)
+            at = replace(at, hardness=torch.where(good, followed, at.hardness), alpha=used)
         at = replace(
             at,
             status=torch.where(active, torch.maximum(at.status, status), at.status),

@@ -25,12 +25,12 @@ class MechanicsInput(Generic[Settings]):
     dt: h. longest: µm, by which a cell may grow in one sub-step. position (N, d) float64 µm, axis
     (N, d), length (N,) µm with its elongation (N,) of this step, radius (N,) µm; move (N, D), the
     last one; collapsed (N,) int64, steps in a row in which contacts have not held the cell's
-    colony; contact_alpha (N,), α of the last step, and compression (N,) µm: None of bilateral
-    contacts. viscosity, length_drag, and alpha or stiffness where one of them is given: 0-dim or
-    (N,); drag (N,), a factor of viscosity, or None. colony_id (B,). walls: for each surface its
-    kind ("hard", "stiffness", "weight") and that value, 0-dim or (N,). bonds: of cells that stick
-    together, or None. drift: (N, d + turns), how far they have moved and turned by themselves in
-    this step, or None.
+    colony; contact_alpha (N,), α with which the step begins, and compression (N,) µm: None of
+    bilateral contacts. viscosity, length_drag, and alpha or stiffness where one of them is given:
+    0-dim or (N,); drag (N,), a factor of viscosity, or None. colony_id (B,). walls: for each
+    surface its kind ("hard", "stiffness", "weight") and that value, 0-dim or (N,). bonds: of cells
+    that stick together, or None. drift: (N, d + turns), how far they have moved and turned by
+    themselves in this step, or None.
     """
 
     settings: Settings
@@ -81,12 +81,12 @@ class StepInput(Generic[Settings]):
 
     position (N, d) float64 µm, axis (N, d), length (N,) µm before growth, growth (N,) µm, radius
     (N,) µm; viscosity, length_drag (N,); steps (B,) sub-steps, 0 for a colony that cannot be
-    stepped; start (N, D) the last move; hardness (B,) float64 the α of the colony's last step, 0 at
-    the start and for bilateral contacts; alpha (N,) where it is given, else None, and of bilateral
-    contacts always; walls: for each surface its kind ("hard", "stiffness", "weight") and its
-    weight, or its stiffness · Δt of the sub-step, (N,); shortest (N,) µm, of one-sided contacts: no
-    cell becomes shorter by pressure. bonds: with stiffness · Δt of the sub-step, or None. drift:
-    see `MechanicsInput`.
+    stepped; start (N, D) the last move; hardness (B,) float64 the α with which the colony's step
+    begins, 0 at the start and for bilateral contacts; alpha (N,) where it is given, else None, and
+    of bilateral contacts always; walls: for each surface its kind ("hard", "stiffness", "weight")
+    and its weight, or its stiffness · Δt of the sub-step, (N,); shortest (N,) µm, of one-sided
+    contacts: no cell becomes shorter by pressure. bonds: with stiffness · Δt of the sub-step, or
+    None. drift: see `MechanicsInput`.
     """
 
     settings: Settings
@@ -117,8 +117,9 @@ class StepInput(Generic[Settings]):
 
 @dataclass(frozen=True)
 class StepResult:
-    """Where cells are after the steps, the move to start from next, α of each colony, and what the
-    solves did: see `contact_records.ContactReport`; `error` is its residual."""
+    """Where cells are after the steps, the move to start from next, α of each colony for the next
+    step (hardness), and what the solves did: see `contact_records.ContactReport`; `error` is its
+    residual."""
 
     position: Tensor
     axis: Tensor
@@ -131,3 +132,4 @@ class StepResult:
     passes: Tensor
     clipped: Tensor
     deeply_overlapping: Tensor
+    alpha: Tensor

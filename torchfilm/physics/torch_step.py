@@ -39,7 +39,7 @@ def step(given: MechanicsInput) -> MechanicsResult:
         given.groups.spread(collapsed), alpha, compression,
         ContactReport(
             torch.where(lasting, COLLAPSED, status), found.iterations, found.error, found.passes,
-            found.clipped, found.deeply_overlapping,
+            found.clipped, found.deeply_overlapping, found.alpha,
         ), steps,
     )  # fmt: skip
 
