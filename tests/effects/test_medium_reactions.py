@@ -332,3 +332,32 @@ def test_settings_reach_it():
 def test_reactions_need_a_medium():
     with pytest.raises(tf.InputError, match=r"this scene has none: list tf\.Medium"):
         tf.Scene(tf.MediumReactions(degrade, parameters={"k": 1.0}), dim=2).bind()
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_explain_says_how_fast_reactions_are_in_a_step(backend):
+    """Schnakenberg's at rest: |λ|² = det = g²(a + b)², and no cell takes part in them."""
+
+    def schnakenberg(s, p):
+        eaten = s.u**2 * s.v
+        return {"u": p.g * (p.a - s.u + eaten), "v": p.g * (p.b - eaten)}
+
+    constants = {"a": 0.1, "b": 0.9, "g": 20.0}
+    signals = {"u": tf.Signal(diffusion=10.0, initial=1.0), "v": tf.Signal(400.0, initial=0.9)}
+    effects = [
+        tf.MediumReactions(schnakenberg, parameters=constants, backend=backend),
+        tf.Medium(**signals, **BOX, exchange="turns"),
+    ]
+    said = str(tf.explain(tf.Scene(*effects, dim=2, dt=0.05)))
+    assert "fastest rate at these concentrations 20/h, 1 in a step" in said
+    own = "a cell finds its own steady signal"
+    assert own not in said
+    gives = tf.Circuit(lambda u, s, p, cell: ({"made": -u.made}, {"u": 1.0}), species="made")
+    assert own in str(tf.explain(tf.Scene(gives, *effects, dim=2, dt=0.05)))
+
+
+def test_rates_with_an_infinite_slope_have_no_fastest_one():
+    scene = tf.Scene(
+        tf.MediumReactions(lambda s, p: {"u": -(s.u**0.5)}), medium(u=0.0), dim=2, dt=0.05
+    )
+    assert "fastest rate at these concentrations" in str(tf.explain(scene))

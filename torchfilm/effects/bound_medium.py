@@ -184,6 +184,11 @@ class BoundMedium(_MediumPart):
             if e.stage != LYSIS:
                 given_by_burst -= {*e.reads(), *e.writes()}
         self.found = frozenset(n for n in self.effect.signals if OUTSIDE + n not in given_by_burst)
+        every = {OUTSIDE + n for n in self.effect.signals}
+        with_signals = [e for e in others if every & {*e.reads(), *e.writes()}]
+        no_cells = with_signals and all(e.works_on_grid for e in with_signals)
+        if no_cells and not any(e.effect.writes_anything for e in others):
+            self.found = frozenset()
         why = next((why for e in circuits if e.exchanges() and (why := e.why_turns)), "")
         if both := [n for n in given if n in eaten]:
             why = f"Nutrition moves {both[0]}, and a circuit exchanges it, too."

@@ -50,7 +50,8 @@ def correlation(state: State, name: str | Tensor, edges: row_checks.Numbers) -> 
     """How alike a quantity y is in two cells of a colony by the distance of their centres, (B, K)
     float64: the mean of (yᵢ − ȳ)(yⱼ − ȳ) over the pairs in each bin of distances, over the variance
     of y. 1 for pairs as alike as a cell is itself, 0 where nothing is shared (−1/(n − 1) of n
-    cells); its first maximum beyond 0 is the wavelength of patterns. NaN without pairs or variance.
+    cells); its first maximum beyond 0 is at 1.12 wavelengths of stripes in the plane, where it
+    follows J₀(2πr/λ), and at one in a narrow channel. NaN without pairs or variance.
 
     name: as for `profile`. edges: of the bins, K + 1 of them, µm, ascending from 0 or more. In a
     periodic space distances are those to the nearest image."""
