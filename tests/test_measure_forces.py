@@ -116,3 +116,18 @@ def test_where_alpha_is_given_forces_are_of_it(given, options):
 def test_bilateral_contacts_report_no_alpha(options):
     (state,) = tf.simulate(two(contacts="bilateral", **options), until=0.025, colonies=2)
     assert state.reports["mechanics"].alpha.tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("options", BACKENDS, ids=["compiled", "torch"])
+def test_a_colony_without_cells_has_no_alpha(options):
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Mechanics(dim=2, **options), tf.Rules(only_the_first), dim=2
+    )
+    *_, state = tf.simulate(scene, until=0.1, colonies=3)
+    alpha = state.reports["mechanics"].alpha
+    assert state.counts.tolist() == [1, 0, 1]
+    assert float(alpha[1]) == 0.0 and bool((alpha[[0, 2]] > 0).all())
+
+
+def only_the_first(cells):
+    cells.remove_flag = cells.colony == 1

@@ -95,16 +95,35 @@ def test_whole_numbers_have_a_range_where_their_colours_are_logarithmic():
         ({"log": "gfp"}, "log = 'gfp'.*drawn quantity: 'yfp'"),
         ({"log": ["yfp", 3]}, "log = .*the names of drawn quantities"),
         ({"log": 1}, "log = 1"),
-        ({"log": True, "limits": {"yfp": (0, 2)}}, r"limits\['yfp'\] = \(0, 2\).*above 0"),
+        ({"log": True, "limits": {"yfp": (0, 2)}}, r"limits\['yfp'\] = \(0.0, 2.0\).*above 0"),
         ({"log": True, "colour": "angle"}, "angle has no range of values"),
         ({"log": ["angle"], "colour": "angle"}, "log = 'angle'.*left out"),
         ({"log": True, "colour": None}, "cell_type has no range of values"),
+        ({"log": True, "colour": "rgb"}, "log = True.*rgb is a colour itself"),
+        ({"log": "rgb", "colour": "rgb"}, "log = 'rgb'.*rgb is a colour itself"),
     ],
 )
 def test_what_has_no_logarithm_is_refused(options, message):
-    what = frame(PLACES[:2], cell_type=np.array([0, 1]), yfp=[1.0, 2.0])
+    what = frame(PLACES[:2], cell_type=np.array([0, 1]), yfp=[1.0, 2.0], rgb=np.ones((2, 3)))
     with pytest.raises(tf.InputError, match=message):
         plan_layout([what], [0], PlotStyle(**{"colour": "yfp", **options}))
+
+
+def test_limits_of_a_signal_by_its_short_name_are_those_of_its_logarithm():
+    for log in ("out.ahl", "ahl", True):
+        with pytest.raises(tf.InputError, match=r"limits\['out.ahl'\] = \(0.0, 1.0\).*above 0"):
+            PlotStyle(colour="length", background="ahl", limits={"ahl": (0, 1)}, log=log)
+    PlotStyle(colour="yfp", background="ahl", limits={"ahl": (0, 1)}, log="yfp")
+
+
+def test_the_ends_of_a_narrow_range_are_apart_in_words():
+    from matplotlib.figure import Figure
+
+    seen, below = ValueRange(), Figure().subplots()
+    seen.add(np.array([100.0, 100.9]))
+    scale = scale_of("yfp", seen, PlotStyle(colour="yfp", log=np.True_), {})
+    tf.pictures.colour_bar(below, scale)
+    assert [t.get_text() for t in below.get_xticklabels()] == ["100", "100.449", "100.9"]
 
 
 def test_axes_of_a_figure_of_ones_own():
@@ -137,7 +156,7 @@ def run(tmp_path_factory):
         cells.level = torch.where(x < 1.0, 0.0, 10.0 ** (x / 4.0 + 10.0 * cells.time))
 
     scene = tf.Scene(
-        tf.Rules(update=rise, variables={"level": 0.0}),
+        tf.Rules(update=rise, variables={"level": 0.0, "none": 0.0}),
         founders=tf.Cells(PLACES[:4], [1.0, 0.0], 0.0), dim=2, dt=0.1,
     )  # fmt: skip
     list(tf.simulate(scene, until=0.3, record=tf.Recorder(path, scene, every=1)))
@@ -156,6 +175,21 @@ def test_a_kymograph(run):
     assert picture.figure.axes[1].get_yscale() == "log"
     given = tf.pictures.kymograph(run, "level", edges=edges, log=True, limits=(1.0, 1e6))
     assert given.figure.axes[0].collections[0].norm.vmax == 1e6
+    with pytest.raises(tf.InputError, match=r"limits = \(0, 1\).*above 0"):
+        tf.pictures.kymograph(run, "level", log=True, limits=(0, 1))
+    with pytest.raises(tf.InputError, match="one of"):
+        tf.pictures.kymograph(run, "angle", log=True)
+
+
+def test_a_field_of_any_name_has_the_range_of_its_values(tmp_path):
+    """An angle of one's own is no angle of an axis."""
+    scene = tf.Scene(
+        tf.Rules(lambda cells: None, variables={"angle": 7.0, "cell_type_": 2.0}),
+        founders=tf.Cells(PLACES[:2], [1.0, 0.0], 0.0), dim=2, dt=0.1,
+    )  # fmt: skip
+    list(tf.simulate(scene, until=0.2, record=tmp_path / "run.h5"))
+    mesh = tf.pictures.kymograph(tmp_path / "run.h5", "angle", limits=(5.0, 9.0)).figure.axes[0]
+    assert mesh.collections[0].norm.vmin == 5.0 and mesh.collections[0].norm.vmax == 9.0
 
 
 def test_a_time_course(run):
@@ -163,5 +197,7 @@ def test_a_time_course(run):
     assert plain[1].get_yscale() == "linear"
     counts, level = tf.pictures.time_course(run, "level", log=True).figure.axes
     assert level.get_yscale() == "log" and counts.get_yscale() == "linear"  # four cells throughout
+    (_, none) = tf.pictures.time_course(run, "none", log=True).figure.axes  # 0 throughout
+    assert none.get_yscale() == "linear"
     with pytest.raises(tf.InputError, match="log = 'level'"):
         tf.pictures.time_course(run, "level", log="level")

@@ -358,6 +358,27 @@ def test_explain_says_how_fast_reactions_are_in_a_step(backend):
 
 def test_rates_with_an_infinite_slope_have_no_fastest_one():
     scene = tf.Scene(
-        tf.MediumReactions(lambda s, p: {"u": -(s.u**0.5)}), medium(u=0.0), dim=2, dt=0.05
+        tf.MediumReactions(lambda s, p: {"u": -((1.0 - s.u) ** 0.5)}), medium(u=1.0), dim=2, dt=0.05
     )
-    assert "fastest rate at these concentrations" in str(tf.explain(scene))
+    assert "fastest rate at these concentrations inf/h" in str(tf.explain(scene))
+
+
+def test_the_fastest_rate_does_not_depend_on_the_size_of_other_signals():
+    """Monod's at half saturation: k K/(K + a)² = 2.5/h, beside what has a far larger unit."""
+    for other in (1.0, 1e5):
+        scene = tf.Scene(
+            tf.MediumReactions(lambda s, p: {"a": -0.01 * s.a / (1e-3 + s.a), "b": 0.0 * s.b}),
+            medium(a=1e-3, b=other), dim=2, dt=0.05,
+        )  # fmt: skip
+        assert "fastest rate at these concentrations 2.5/h, 0.1" in str(tf.explain(scene))
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_a_source_that_depends_on_nothing(backend):
+    scene = tf.Scene(
+        tf.MediumReactions([tf.Reaction.of("-> u", rate=2.0)], backend=backend),
+        medium(u=1.0), dim=2, dt=0.05,
+    )  # fmt: skip
+    assert "fastest rate at these concentrations 0/h" in str(tf.explain(scene))
+    state = later(scene, 0.5)
+    assert torch.allclose(state.signals["u"], torch.full_like(state.signals["u"], 2.0))

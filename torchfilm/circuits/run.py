@@ -151,7 +151,8 @@ class CircuitCells:
         rows = self.rows.index_select(0, rows)
         inside, outside = self.changes(u, rows)
         none = torch.zeros_like(u[:, 0])
-        columns = [inside.get(n, none) for n in self.species]
+        # a rate that depends on nothing may be one number
+        columns = [inside.get(n, none).expand_as(none) for n in self.species]
         if self.exchanged:
             new = [n for n in outside if n not in self.exchanged]
             if new:
@@ -159,7 +160,7 @@ class CircuitCells:
                     f"{self.label} gave {new[0]!r} to the medium, and had not in its trial: always"
                     " return it, 0 where nothing passes."
                 )
-            flux = [outside.get(n, none) for n in self.exchanged]
+            flux = [outside.get(n, none).expand_as(none) for n in self.exchanged]
             if self.ramp is not None:
                 columns += [
                     self.ramp[n][1].index_select(0, rows).to(u.dtype) for n in self.exchanged

@@ -42,8 +42,9 @@ class Show:
     """A signal to draw behind the cells, from white (lowest) to black (highest)."""
     limits: list[str] = field(default_factory=list)
     """Ranges of colours, as NAME=LOW:HIGH, such as --limits yfp=0:2."""
-    log: list[str] = field(default_factory=list)
-    """Drawn quantities with logarithmic colours, such as --log yfp ahl."""
+    log: list[str] | None = None
+    """Logarithmic colours of these drawn quantities, such as --log yfp ahl; of all without names.
+    """
     view: str = "xy"
     """xy, xz or yz."""
     section: str = "cells"
@@ -100,7 +101,7 @@ class Show:
             "channels": cli_options.channels_of(self.channels),
             "background": self.background,
             "limits": cli_options.limits_of(self.limits),
-            "log": self.log,
+            "log": self.log is not None and (self.log or True),
             "view": self.view,
             "section": cli_options.section_of(self.section),
             "whole": self.whole,

@@ -185,9 +185,10 @@ class BoundMedium(_MediumPart):
                 given_by_burst -= {*e.reads(), *e.writes()}
         self.found = frozenset(n for n in self.effect.signals if OUTSIDE + n not in given_by_burst)
         every = {OUTSIDE + n for n in self.effect.signals}
-        with_signals = [e for e in others if every & {*e.reads(), *e.writes()}]
+        among = [e for e in effects if e.place != self.place]
+        with_signals = [e for e in among if every & {*e.reads(), *e.writes()}]
         no_cells = with_signals and all(e.works_on_grid for e in with_signals)
-        if no_cells and not any(e.effect.writes_anything for e in others):
+        if no_cells and not any(e.effect.writes_anything for e in among):
             self.found = frozenset()
         why = next((why for e in circuits if e.exchanges() and (why := e.why_turns)), "")
         if both := [n for n in given if n in eaten]:

@@ -360,13 +360,13 @@ class BoundReactions(BoundEffect):
         columns = [state.fields[OUTSIDE + n].index_select(0, rows) for n in self.species]
         u, voxels = torch.stack(columns, 1).double(), self._voxels(state, rows)
         every = torch.arange(len(rows), device=rows.device)
-        near, begin = 1e-6 * (u + u.amax() + self.effect.atol), voxels.rates(u, every)
+        near, begin = 1e-6 * (u + u.amax(0) + self.effect.atol), voxels.rates(u, every)
         change = torch.diag_embed(near).unbind(1)
         slopes = torch.stack(
             [(voxels.rates(u + d, every) - begin) / near[:, k, None] for k, d in enumerate(change)],
             2,
         )
-        if not bool(torch.isfinite(slopes).all()):  # as of a root at 0
+        if not bool(torch.isfinite(slopes).all()):  # as at the end of a root's range
             return math.inf
         return float(torch.linalg.eigvals(slopes).abs().max())
 

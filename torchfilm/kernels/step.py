@@ -425,6 +425,7 @@ def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, 
                 move_along(own_x, own_axis, drift, -1.0, dof)
             for _ in range(steps):
                 give_back(memory, top)
+                report[ALPHA] = 0.0
                 if steps > 1:
                     move_along(own_x, own_axis, drift, 1.0 / steps, dof)
                 step_colony(

@@ -123,7 +123,7 @@ class _OneStep:
         least = torch.maximum(base - SHRINK * self.growth.clamp(min=0.0), given.shortest)
         at = replace(at, length=torch.where(moving, base + self.growth, base))
         hardness = torch.where(at.hardness > 0, at.hardness, self.softest)
-        at = replace(at, hardness=hardness)
+        at = replace(at, hardness=hardness, alpha=torch.where(active, 0.0, at.alpha))
         for number in range(1 if given.settings.soft else int(given.settings.passes)):
             pairs, walls = self._contacts(at, rows, number == 0)
             gap = pairs.gap.detach()
@@ -243,7 +243,8 @@ class _OneStep:
             followed = self._followed(solved.hardness, part, after, contacts, walls)
             followed = torch.where(solved.fell, solved.hardness, followed)
             good = sound & (end.error <= settings.tolerance)
-            used = torch.where(good, solved.hardness.detach(), at.alpha)
+            some = good & (self.groups.counts > 0)
+            used = torch.where(some, solved.hardness.detach(), at.alpha)
             at = replace(at, hardness=torch.where(good, followed, at.hardness), alpha=used)
         at = replace(
             at,

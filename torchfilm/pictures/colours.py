@@ -109,15 +109,17 @@ class PlotStyle:
             raise checks.input_error("limits", self.limits, rule)
         self._check_log()
         for name, pair in (self.limits or {}).items():
-            low, _ = checked_range(f"limits[{name!r}]", pair)
+            checked_range(f"limits[{name!r}]", pair)
             self._check_drawn("limits", name)
-            if self.is_log(name) and low <= 0:
+        for drawn in filter(self.is_log, (*self.quantities, *filter(None, [self.signal]))):
+            given = self.given_limits(drawn)
+            if given is not None and given[0] <= 0:
                 rule = "a range above 0, where its colours are logarithmic"
-                raise checks.input_error(f"limits[{name!r}]", pair, rule)
+                raise checks.input_error(f"limits[{drawn!r}]", given, rule)
 
     def _check_log(self) -> None:
         """Raise InputError unless quantities with a range are drawn by their logarithms."""
-        if isinstance(self.log, bool):
+        if isinstance(self.log, (bool, np.bool_)):
             if self.log and self.colour in (ANGLE, TYPES) and self.background is None:
                 rule = f"left out: {self.colour} has no range of values"
                 raise checks.input_error("log", True, rule)
@@ -143,15 +145,15 @@ class PlotStyle:
     @property
     def _logarithmic(self) -> tuple[str, ...]:
         """The quantities whose colours are logarithmic, where these are named."""
-        if isinstance(self.log, bool):
+        if isinstance(self.log, (bool, np.bool_)):
             return ()
         return (self.log,) if isinstance(self.log, str) else tuple(self.log)
 
     def is_log(self, name: str) -> bool:
         """Whether the colours of a quantity are logarithmic. A name without "out." means the cells'
         quantity of that name, where one is drawn."""
-        if isinstance(self.log, bool):
-            return self.log and name not in (ANGLE, TYPES)
+        if isinstance(self.log, (bool, np.bool_)):
+            return bool(self.log) and name not in (ANGLE, TYPES)
         if name == self.signal and self.background not in self.quantities:
             return name in self._logarithmic or self.background in self._logarithmic
         return name in self._logarithmic
@@ -192,6 +194,10 @@ class PlotStyle:
                 self.background,
                 "a signal of the medium: " + (", ".join(frame.signals) or "there is none"),
             )
+        for name in self.quantities if self.channels is None else ():
+            alone = self.background is None and self.is_log(name)
+            if is_rgb(frame.cells, name) and (alone or name in self._logarithmic):
+                raise checks.input_error("log", self.log, f"left out: {name} is a colour itself")
         known = [n for n, v in frame.cells.items() if v.ndim == 1]
         if self.channels is None:
             known += [n for n in frame.cells if is_rgb(frame.cells, n)]

@@ -352,7 +352,7 @@ def colour_bar(ax: Axes, scale: Scale) -> None:
     elif scale.log:
         low, high = scale.limits
         norm, ticks = LogNorm(low, high), np.array([low, math.sqrt(low * high), high])
-        words = [f"{x:.3g}" for x in ticks]
+        words = [f"{x:.3g}" for x in ticks] if high > 2 * low else numbers(ticks)
     else:
         low, high = scale.limits
         norm, ticks = Normalize(low, high), np.array([low, 0.5 * (low + high), high])

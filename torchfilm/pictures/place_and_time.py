@@ -14,7 +14,7 @@ from torchfilm.io.blocks import blocks
 from torchfilm.io.identity import declared_fields
 from torchfilm.io.results import Results
 from torchfilm.physics import capsule
-from torchfilm.pictures.colours import PlotStyle, Scale, ValueRange, checked_range, scale_of
+from torchfilm.pictures.colours import MEAN, PlotStyle, Scale, ValueRange, checked_range, scale_of
 from torchfilm.pictures.figures import check_not_results, opened
 from torchfilm.pictures.page import checked_dpi
 from torchfilm.pictures.picture import Picture, new_figure
@@ -50,15 +50,13 @@ def kymograph(
     what: a results file, or its path. quantity: a field of the cells, or a signal at them as
     "out.NAME". along: "x", "y", "z", or "radius" from the colony's centre. edges: of the bins, µm,
     ascending; default bins of 1 µm where there are cells. colony: its id; default the first.
-    limits: the range of colours; default that of the means. log: logarithmic colours, as for
-    `show`. out: save the picture there."""
+    limits: the range of colours; default that of the means, of a concentration 1 % or wider. log:
+    logarithmic colours, as for `show`. out: save the picture there."""
     with opened(what) as results:
         check_not_results(results.path, out)
         checks.choice("along", along, ALONG[: int(results.attributes["dim"])] + ALONG[3:])
         checked_dpi(dpi)
-        checks.choice("log", log, (True, False))
-        given = None if limits is None else {quantity: checked_range("limits", limits)}
-        style = PlotStyle(colour=quantity, limits=given, log=log)
+        style = _style(limits, log)
         if len(results) < 2:
             raise checks.InputError(f"a kymograph needs two frames, and {results.path} has one")
         ids = results.colony_id.tolist()
@@ -80,7 +78,7 @@ def kymograph(
         grid = binned_mean(groups, value, place, bins.tolist()).numpy()
         unit, drawn = unit_at_cells(results, quantity), ValueRange()
         drawn.add(grid)
-        scale = scale_of(quantity, drawn, style, {quantity: unit})
+        scale = scale_of(MEAN, drawn, style, {MEAN: unit})
         figure = new_figure(5.0, 4.0, dpi)
         ax = figure.add_subplot()
         mesh = _draw(ax, bins, _between(results.times), grid, scale)
@@ -93,6 +91,16 @@ def kymograph(
         bar = figure.colorbar(mesh, extend=scale.beyond)
         bar.set_label(f"mean of {quantity}" + f" ({unit})" * bool(unit), parse_math=False)
         return Picture(figure, out)
+
+
+def _style(limits: tuple[float, float] | None, log: bool) -> PlotStyle:
+    """How means are coloured, whatever they are of."""
+    checks.choice("log", log, (True, False))
+    given = None if limits is None else checked_range("limits", limits)
+    if log and given is not None and given[0] <= 0:
+        rule = "a range above 0, where colours are logarithmic"
+        raise checks.input_error("limits", limits, rule)
+    return PlotStyle(colour=MEAN, limits=None if given is None else {MEAN: given}, log=log)
 
 
 def _draw(ax: Any, bins: np.ndarray, times: np.ndarray, grid: np.ndarray, scale: Scale) -> Any:

@@ -83,7 +83,8 @@ def time_course(
         _finish(axes[0], "cells", log=bool(counts.max(initial=0.0) > TENFOLD * max(1, some)))
         for row, name in enumerate(quantities):
             unit = unit_at_cells(results, name)
-            _finish(axes[1 + row], f"mean of {name}" + f" ({unit})" * bool(unit), log)
+            some = bool((seen[:, :, 1 + row] > 0).any())  # or there is no logarithm
+            _finish(axes[1 + row], f"mean of {name}" + f" ({unit})" * bool(unit), log and some)
         axes[-1].set_xlabel("time (h)")
         if len(results.colony_id) > 1 or by is not None:
             axes[0].legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
