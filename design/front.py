@@ -19,9 +19,9 @@ from design.objective import Objective
 from design.parameters import Value, show_value
 from design.pareto import nondominated, spread
 from design.reasons import tally
-from design.report import at_bound, cells_in, constrained, cost_words, failure_words
+from design.report import at_bound, cells_in, cost_words, failure_words
 from design.study import Study
-from design.targets.goals import Constrained, Goals, in_words, of_seeds
+from design.targets.goals import Constrained, Goals, constrained, in_words, of_seeds
 from design.trivial import trivial_losses
 from torchfilm import checks, displays
 

@@ -15,8 +15,8 @@ from design.growing import FinishedColonies
 from design.loss_bands import seeds_of_an_end
 from design.parameters import Choice, Parameter, Space, Value, show_value
 from design.study import Study
-from design.targets.base import Target, inner_targets
-from design.targets.goals import Constrained, Goals
+from design.targets.base import Target
+from design.targets.goals import MANY, Constrained, Goals, constrained
 from design.targets.lasting import Lasting
 from design.targets.measured import extinct_words, has_mean_with_error
 from design.task import Task
@@ -29,7 +29,6 @@ LUCKY = 0.8  # of the band on fresh seeds: a search that saw less than this was 
 SUCCESS = 0.25  # of the loss of the best trivial answer: as in the comparison of methods
 SPREADS = 1.7  # standard errors between a mean and its band of 90 %
 MISSES = "misses constraints"  # in place of a loss that says nothing else
-MANY = 1000.0  # a mean over fewer colonies shows that one of them misses constraints
 # Designs of which not all have the same loss by chance: it differs by less than this share of it.
 # (A solver takes other steps where another species changes.)
 ALIKE, DIFFERENT = 8, 1e-3
@@ -309,11 +308,6 @@ def _breaks(bound: str, found: Sequence[float]) -> bool:
 def misses_constraints(target: Target, loss: np.ndarray | float) -> np.ndarray:
     """Whether losses are those of designs that miss constraints, in some colonies at least."""
     return np.logical_and(constrained(target), np.asarray(loss) >= Constrained.BROKEN / MANY)
-
-
-def constrained(target: Target) -> bool:
-    """Whether a target has constraints, or one of its parts."""
-    return isinstance(target, Constrained) or any(map(constrained, inner_targets(target)))
 
 
 def shown_loss(target: Target, loss: float) -> str:

@@ -350,6 +350,19 @@ def test_growth_rates_are_those_that_pressure_leaves():
         tf.measure.growth_rates(states[0], states[-1])
 
 
+def test_changes_are_those_of_the_same_colony():
+    """Cells have numbers within their colony: the first of both colonies is cell 0."""
+    scene = tf.Scene(tf.Growth(rate=[0.5, 1.0]), tf.Motility(speed=[3.0, 6.0]), dim=2)
+    earlier, state = [*tf.simulate(scene, until=0.2, colonies=2)][-2:]
+    passed = state.time - earlier.time
+    rates = tf.measure.growth_rates(state, earlier)
+    assert rates.tolist() == pytest.approx([0.5, 1.0], rel=1e-3)
+    way = tf.measure.displacement(state, earlier).norm(dim=1)
+    assert way.tolist() == pytest.approx([3.0 * passed, 6.0 * passed], rel=1e-3)
+    alone = tf.measure.growth_rates(state.select([1]), earlier)
+    assert torch.equal(alone, rates[1:])
+
+
 def test_upright_cells_have_no_order_in_the_plane():
     made = lambda axes: tf.Scene(tf.Mechanics()).bind(
         cells=tf.Cells([[5.0 * k, 0.0, 0.0] for k in range(2)], axes)

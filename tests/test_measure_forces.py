@@ -118,10 +118,14 @@ def test_bilateral_contacts_report_no_alpha(options):
     assert state.reports["mechanics"].alpha.tolist() == [0.0, 0.0]
 
 
+def all_of_the_second(cells):
+    cells.remove_flag = cells.colony == 1
+
+
 @pytest.mark.parametrize("options", BACKENDS, ids=["compiled", "torch"])
 def test_a_colony_without_cells_has_no_alpha(options):
     scene = tf.Scene(
-        tf.Growth(rate=1.0), tf.Mechanics(dim=2, **options), tf.Rules(only_the_first), dim=2
+        tf.Growth(rate=1.0), tf.Mechanics(dim=2, **options), tf.Rules(all_of_the_second), dim=2
     )
     *_, state = tf.simulate(scene, until=0.1, colonies=3)
     alpha = state.reports["mechanics"].alpha
@@ -129,5 +133,30 @@ def test_a_colony_without_cells_has_no_alpha(options):
     assert float(alpha[1]) == 0.0 and bool((alpha[[0, 2]] > 0).all())
 
 
-def only_the_first(cells):
-    cells.remove_flag = cells.colony == 1
+@pytest.mark.parametrize("options", BACKENDS, ids=["compiled", "torch"])
+@pytest.mark.parametrize("stiffness", [10.0, 50.0])
+def test_soft_cells_meet_in_the_middle_of_their_overlap(stiffness, options):
+    """By the virial theorem Σ p · 2A is the force times the distance of the centres, which is
+    shorter than two half cells by the overlap, some tenths of a µm here."""
+    scene = two(stiffness=stiffness, **options)
+    before = scene.bind().start()
+    for state in tf.simulate(scene, until=0.3):
+        last, before = before, state
+    assert float(tf.measure.overlaps(state).worst) > 0.1
+    from_above = 2 * state.radius.double() * (state.length.double() + math.pi / 4)
+    virial = float((tf.measure.pressure(state, scene) * 2 * from_above).sum())
+    apart = float(state.position[1, 0] - state.position[0, 0])
+    assert virial / apart == pytest.approx(float(drag_of(state, last, 0.025)[1]), rel=1e-4)
+
+
+@pytest.mark.parametrize("weight", [0.3, 0.5, 1.0, {0: 0.5}])
+@pytest.mark.parametrize("given", [{}, {"alpha": 1e-2}], ids=["default", "alpha"])
+def test_a_wall_with_a_weight_pushes_with_the_drag(weight, given):
+    """A cell that lies 0.1 µm deep in it; the less the weight, the less it is pushed out."""
+    wall = tf.Plane(y=-0.4, facing="+y", weight=weight)
+    mechanics = tf.Mechanics(dim=2, walls=[wall], tolerance=1e-3, **given)
+    founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 2.0, cell_type=[0])
+    scene = tf.Scene(mechanics, founders=founders, dt=0.025)
+    (state,) = tf.simulate(scene, until=0.025, dtype=torch.float64)
+    drag = (2.0 + 2 * 0.5) * float(state.position[0, 1]) / 0.025
+    assert float(tf.measure.wall_forces(state, [wall]).force) == pytest.approx(drag, rel=1e-6)

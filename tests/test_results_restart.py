@@ -37,6 +37,19 @@ def test_a_run_from_any_frame_is_the_run_itself(whole, frame):
     )
 
 
+def test_a_run_of_given_streams_goes_on_with_these(tmp_path):
+    """And not with the colonies' numbers, which are the streams by default."""
+    path, scene = tmp_path / "run.h5", make_scene()
+    first = scene.bind(2, seed=11, streams=[7, 3]).start()
+    *_, wanted = tf.simulate(scene, first, until=UNTIL)
+    record(scene, first, path, until=1.05)
+    with tf.Results(path) as results:
+        state = results.state(scene)
+    assert state.stream.tolist() == [7, 3]
+    *_, last = tf.simulate(scene, state, until=UNTIL)
+    assert_same_state(last, wanted)
+
+
 @pytest.mark.parametrize("stop", [1.05, 1.3], ids=["on a frame", "between frames"])
 def test_resume_bit_for_bit(tmp_path, whole, stop):
     """Stopped and resumed, the file holds what the uninterrupted run's file holds, and the lineage

@@ -16,6 +16,8 @@ from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 
+EQUAL = 1e-28  # a variance, relative to the mean square, that roundings make
+
 
 def quantity(measure: str, state: State, name: object) -> Tensor:
     """One number for each cell, (N,) float64: a field, a signal at the cells as "out.NAME", or the
@@ -85,8 +87,11 @@ def pair_correlation(state: State, value: Tensor, edges: Sequence[float]) -> Ten
         box = period.cpu().numpy()
     parts = zip(value.cpu().split(counts), where.cpu().split(counts), strict=True)
     for colony, (own, place) in enumerate(parts):
+        if not len(own):
+            continue
         apart = (own - own.mean()).numpy()
-        if not len(apart) or not apart.any():
+        variance = np.square(apart).mean()
+        if variance <= EQUAL * float(own.square().mean()):  # the mean of equal numbers is rounded
             continue
         tree = cKDTree(place.numpy(), boxsize=box)
         sums = tree.count_neighbors(tree, limits, weights=(apart, apart), cumulative=False)
@@ -96,5 +101,5 @@ def pair_correlation(state: State, value: Tensor, edges: Sequence[float]) -> Ten
             pairs[1] += pairs[0] - len(apart)
         with np.errstate(invalid="ignore", divide="ignore"):
             means = np.where(pairs[1:] > 0, sums[1:] / pairs[1:], np.nan)
-        found[colony] = means / np.square(apart).mean()
+        found[colony] = means / variance
     return value.new_tensor(found)

@@ -14,6 +14,7 @@ import torchfilm as tf
 from design.targets.base import (
     WORST,
     Target,
+    inner_targets,
     of_one_condition,
     ratio,
     require,
@@ -27,6 +28,7 @@ from design.targets.several import Several, SumOfTargets
 from torchfilm import checks
 
 CONCENTRATION = "conc"  # the unit of species
+MANY = 1000.0  # a mean over fewer colonies or steps shows that one of them misses constraints
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ class Weighted(SumOfTargets):
         for part, weight in terms:
             checks.number(f"Weighted: the weight of {type(part).__name__}", weight, above=0.0)
             of_colonies("Weighted", part)
-            if isinstance(part, Constrained):
+            if constrained(part):
                 raise checks.input_error(
                     "Weighted: a target",
                     part.describe(),
@@ -261,6 +263,19 @@ class Constrained(Several):
         return f"{self.target.describe()}, with {in_words(self.bounds)}"
 
 
+def constrained(target: Target) -> bool:
+    """Whether a target has constraints, or one of its parts."""
+    return isinstance(target, Constrained) or any(map(constrained, inner_targets(target)))
+
+
+def _least_broken(target: Target) -> float:
+    """The least loss of a colony that breaks the constraints of a target; of one that should last
+    it is a mean over steps, of which it breaks them in some."""
+    while isinstance(target, Spread):
+        target = target.target
+    return Constrained.BROKEN / (1.0 if isinstance(target, Constrained) else MANY)
+
+
 def in_words(bounds: Mapping[str, str]) -> str:
     """Constraints by measure, as `Target.bounds` has them."""
     return ", ".join(f"{name} {bound}" for name, bound in bounds.items())
@@ -362,11 +377,13 @@ class Goals(Several):
 
     def losses(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         found = super().losses(state, history)
-        some = [isinstance(part, Constrained) for part in self.parts]
+        some = [constrained(part) for part in self.parts]
         if not any(some):
             return found
-        worst = found[:, some].amax(1, keepdim=True)
-        return torch.where(worst >= Constrained.BROKEN, worst, found)
+        least = found.new_tensor([_least_broken(part) for part in self.parts])
+        broken = torch.where(found < least, 0.0, found)[:, some]
+        worst = broken.amax(1, keepdim=True)
+        return torch.where(worst > 0, worst, found)
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         return self.losses(state, history).sum(1)

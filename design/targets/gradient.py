@@ -29,6 +29,8 @@ from torchfilm import checks
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+EQUAL = 1e-28  # a variance, relative to the mean square, that roundings make
+
 
 @dataclass(frozen=True)
 class Gradient(ProfileTarget):
@@ -92,11 +94,11 @@ class Gradient(ProfileTarget):
         means = total(state, torch.stack([w, w * y, w * m], 1))
         mean = (means[:, 1:] / means[:, :1]).index_select(0, state.colony)
         dy, dm = y - mean[:, 0], m - mean[:, 1]
-        squares = total(state, torch.stack([w * dy * dm, w * dy * dy, w * dm * dm], 1))
-        return {
-            "correlation": ratio(squares[:, 0], (squares[:, 1] * squares[:, 2]).sqrt(), math.nan),
-            **super().measures(state),
-        }
+        parts = [w * dy * dm, w * dy * dy, w * dm * dm, w * y * y, w * m * m]
+        both, of_y, of_m, y_square, m_square = total(state, torch.stack(parts, 1)).unbind(1)
+        varied = (of_y > EQUAL * y_square) & (of_m > EQUAL * m_square)
+        found = ratio(both, (of_y * of_m).sqrt(), math.nan)
+        return {"correlation": torch.where(varied, found, math.nan), **super().measures(state)}
 
     def why_undefined(self, measure: str) -> str:
         if measure == "correlation":

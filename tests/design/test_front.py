@@ -452,12 +452,14 @@ def test_the_box_of_a_hypervolume_may_be_given():
     good = every[nondominated(every)]
     own = front.convergence()[1]
     assert np.array_equal(front.convergence((good.min(0), good.max(0)))[1], own)
-    far = front.convergence(((0.0, 0.0), (100.0, 100.0)))[1]
     area, before = 0.0, 100.0
     for one, other in good[np.argsort(good[:, 0])]:
         area += (100.0 - one) * (before - other)
         before = other
-    assert far[-1] == pytest.approx(area / 1e4)
+    # also where the best values of the box are not 0
+    for best, sides in (((0.0, 0.0), 100.0 * 100.0), ((-20.0, -60.0), 120.0 * 160.0)):
+        far = front.convergence((best, (100.0, 100.0)))[1]
+        assert far[-1] == pytest.approx(area / sides)
     for box in (((0.0,), (1.0,)), ((1.0, 0.0), (1.0, 1.0)), (1.0, 2.0, 3.0)):
         with pytest.raises(tf.InputError, match=r"convergence\(box\)"):
             front.convergence(box)

@@ -41,6 +41,11 @@ def dark() -> tf.State:
     return row(LINE, g=0.0, h=0.0)
 
 
+def even() -> tf.State:
+    """Cells of one level, whose mean is rounded."""
+    return row(LINE, g=0.7, h=0.7)
+
+
 def alone() -> tf.State:
     return row([0.0], g=1.0, h=0.0)
 
@@ -68,6 +73,12 @@ UNDEFINED = {
         lit,
         "correlation",
         "gradient from 1 at 20 µm to 0 at 30 µm is flat",
+    ),
+    "correlation of cells of one level": (
+        Gradient("g", "x", -5.0, 5.0),
+        even,
+        "correlation",
+        "all cells have one level",
     ),
     "contrast of a stripe": (Stripe("g", at=0.0, width=9.0), lit, "contrast", "farther than 18"),
     "peak of a stripe": (Stripe("g", at=0.0, width=9.0), alone, "peak", "fewer than three cells"),

@@ -8,14 +8,12 @@ from torch import Tensor
 from torchfilm.measure.of_a_state import of_a_state
 from torchfilm.measure.shape import below_top, colony_centre
 from torchfilm.physics.nearby import pairs_within
-from torchfilm.spatial import binned_mean, checked_edges, pair_correlation, quantity
+from torchfilm.spatial import EQUAL, binned_mean, checked_edges, pair_correlation, quantity
 from torchfilm.state import State
 from torchfilm.tools import checks, row_checks
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.vectors import safe_norm
-
-EQUAL = 1e-28  # a variance, relative to the mean square, that roundings make
 
 
 @of_a_state
