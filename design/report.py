@@ -287,7 +287,11 @@ def _missed(report: SearchReport) -> str:
     """Which constraints colonies of the best design break."""
     target, best = report.task.target, report.best
     losses = best.losses if best.fresh is None else best.fresh.losses
-    if not constrained(target) or not best.colonies or np.max(losses) < Constrained.BROKEN:
+    if (
+        not constrained(target)
+        or not best.colonies
+        or not misses_constraints(target, np.max(losses))
+    ):
         return ""
     found = each_measured(target, best.colonies)
     broken = {n: b for n, b in target.bounds.items() if _breaks(b, found[n])} or target.bounds

@@ -124,6 +124,8 @@ def test_show_passes_on_what_is_asked(command, shining, monkeypatch):
             "colonies": [1],
         }
     ]
+    command("show", "a.h5", "--log")
+    assert seen.pop()["log"] is True
     command("show", "a.h5")
     assert seen[1] == {
         "out": Path("a.png"),

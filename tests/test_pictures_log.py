@@ -123,7 +123,17 @@ def test_the_ends_of_a_narrow_range_are_apart_in_words():
     seen.add(np.array([100.0, 100.9]))
     scale = scale_of("yfp", seen, PlotStyle(colour="yfp", log=np.True_), {})
     tf.pictures.colour_bar(below, scale)
-    assert [t.get_text() for t in below.get_xticklabels()] == ["100", "100.449", "100.9"]
+    assert [t.get_text() for t in below.get_xticklabels()] == ["100", "100.45", "100.9"]
+
+
+def test_small_numbers_of_a_narrow_range_have_exponents():
+    from matplotlib.figure import Figure
+
+    seen, below = ValueRange(), Figure().subplots()
+    seen.add(np.array([1e-20, 1.5e-20]))
+    tf.pictures.colour_bar(below, scale_of("yfp", seen, PlotStyle(colour="yfp", log=True), {}))
+    words = [t.get_text() for t in below.get_xticklabels()]
+    assert words == ["1e-20", "1.22e-20", "1.5e-20"]
 
 
 def test_axes_of_a_figure_of_ones_own():
@@ -141,6 +151,8 @@ def test_axes_of_a_figure_of_ones_own():
     values = np.array([1.0, 1e2, 1e4]).reshape(3, 1, 1)
     signal = tf.pictures.draw_signal(ax, values, [0, 0, 0], [1, 1, 1], log=True)
     assert signal.paint(np.array([1e2]))[0, :3] == pytest.approx(0.5, abs=NEAR)
+    with pytest.raises(tf.InputError, match="rgb is a colour itself"):
+        tf.pictures.draw_cells(ax, cells | {"rgb": np.ones((3, 3))}, colour="rgb", log=True)
     with pytest.raises(tf.InputError, match="log = 'signal'"):
         tf.pictures.draw_signal(ax, values, [0, 0, 0], [1, 1, 1], log="signal")
 

@@ -16,7 +16,7 @@ from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 
-EQUAL = 1e-28  # a variance, relative to the mean square, that roundings make
+EQUAL = 1e-20  # a variance, relative to the mean square, that roundings of many cells' mean make
 
 
 def quantity(measure: str, state: State, name: object) -> Tensor:

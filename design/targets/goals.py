@@ -269,11 +269,11 @@ def constrained(target: Target) -> bool:
 
 
 def _least_broken(target: Target) -> float:
-    """The least loss of a colony that breaks the constraints of a target; of one that should last
-    it is a mean over steps, of which it breaks them in some."""
-    while isinstance(target, Spread):
-        target = target.target
-    return Constrained.BROKEN / (1.0 if isinstance(target, Constrained) else MANY)
+    """The least loss of a colony that breaks the constraints of a target. Where it is to last, that
+    is a mean over steps, of which the colony breaks them in some."""
+    inside = [_least_broken(part) for part in inner_targets(target) if constrained(part)]
+    alone = Constrained.BROKEN if isinstance(target, Constrained | Spread) else 0.0
+    return min([alone, *inside]) if alone else Constrained.BROKEN / MANY
 
 
 def in_words(bounds: Mapping[str, str]) -> str:
@@ -314,7 +314,9 @@ class Spread(Several):
         """Where a seed fails or breaks a constraint, the design has the worst of their losses:
         seeds that all do are alike, and no goal."""
         wide = losses.std(1, ddof=1) if losses.shape[1] > 1 else np.zeros(len(losses))
-        wide = np.where((losses >= Constrained.BROKEN).any(1), losses.max(1), wide)
+        own = constrained(self.target)
+        least = _least_broken(self.target) if own else Constrained.BROKEN  # of another goal
+        wide = np.where((losses >= least).any(1), losses.max(1), wide)
         return np.where((losses == self.failed).any(1), self.failed, wide)
 
     def describe(self) -> str:
@@ -383,7 +385,10 @@ class Goals(Several):
         least = found.new_tensor([_least_broken(part) for part in self.parts])
         broken = torch.where(found < least, 0.0, found)[:, some]
         worst = broken.amax(1, keepdim=True)
-        return torch.where(worst > 0, worst, found)
+        # broken in some steps counts as broken: the more, the larger the share of the steps
+        share = Constrained.BROKEN + worst / Constrained.BROKEN
+        counted = torch.where(worst < Constrained.BROKEN, share, worst)
+        return torch.where(worst > 0, counted, found)
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         return self.losses(state, history).sum(1)
@@ -391,7 +396,14 @@ class Goals(Several):
     def remark(self, loss: np.ndarray) -> str:
         if not self.bounds:
             return ""
-        return _nearest(float(np.min(loss)) / len(self.parts) - Constrained.BROKEN, self.bounds)
+        share = float(np.min(loss)) / len(self.parts) - Constrained.BROKEN
+        lasting = (
+            _least_broken(part) < Constrained.BROKEN for part in self.parts if constrained(part)
+        )
+        if share >= 0 and any(lasting):
+            words = in_words(self.bounds)
+            return f"no design of the first batch meets the constraints ({words}) in all steps"
+        return _nearest(share, self.bounds)
 
     def describe(self) -> str:
         return "; ".join(part.describe() for part in self.parts)

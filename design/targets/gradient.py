@@ -29,7 +29,7 @@ from torchfilm import checks
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-EQUAL = 1e-28  # a variance, relative to the mean square, that roundings make
+EQUAL = 1e-20  # a variance, relative to the mean square, that roundings of many cells' mean make
 
 
 @dataclass(frozen=True)

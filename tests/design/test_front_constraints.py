@@ -23,6 +23,7 @@ from design import (
     Spread,
     Weighted,
 )
+from design.targets.goals import Goals
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 
@@ -125,6 +126,24 @@ def test_a_constraint_beside_a_ready_target_is_no_failure():
     made = Search(lit, LIT, targets=goals, cells=3, replicates=2, method=NSGA2(population=8))
     made.run(40, progress=False)
     assert not made.study.failures()
+
+
+def test_what_is_broken_in_some_steps_is_broken_in_all_goals():
+    """The more, the larger the share of the steps; and a spread of such losses is no goal of 0."""
+    lasting = Lasting(Constrained(Level(), at_least={"mean_level": 1.0}), since=0.0)
+    for part in (lasting, Constrained(lasting, at_most={"mean_level": 9.0})):
+        goals, found = Goals((part, Spread(Burden(("gfp",))), Burden(("gfp",)))), []
+        for dark in (0, 1, 6):
+            states = [row([0.0], gfp=0.0 if k < dark else 2.0) for k in range(10)]
+            history = torch.stack([goals.note(state) for state in states])
+            found.append(goals.losses(states[-1], history)[0])
+        assert bool((found[0] < 10.0).all())
+        assert all(bool((x >= Constrained.BROKEN).all()) for x in found[1:])
+        assert bool((found[2] > found[1]).all())
+        two = torch.stack([found[1], found[1]]).numpy()[None]
+        assert float(goals.parts[1].reduced(two[:, :, 1])[0]) >= Constrained.BROKEN
+    alone = np.array([[3e8, 3e8], [2.0, 4.0]])
+    assert Spread(lasting).reduced(alone).tolist() == [3e8, pytest.approx(2.0**0.5)]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -43,7 +43,7 @@ def dark() -> tf.State:
 
 def even() -> tf.State:
     """Cells of one level, whose mean is rounded."""
-    return row(LINE, g=0.7, h=0.7)
+    return row([0.01 * k for k in range(5000)], g=0.7, h=0.7)
 
 
 def alone() -> tf.State:

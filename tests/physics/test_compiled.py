@@ -74,6 +74,7 @@ def test_both_paths_take_the_same_steps(name):
             assert float(difference) <= 1e-9, (field, float(difference))
         a, b = one.reports["mechanics"], other.reports["mechanics"]
         assert float((one.contact_alpha / other.contact_alpha - 1).abs().max()) <= 1e-6
+        torch.testing.assert_close(a.alpha, b.alpha, rtol=1e-6, atol=0.0)
         assert a.status.tolist() == b.status.tolist() == [0, 0]
         for count in ("passes", "clipped", "deeply_overlapping", "substeps"):
             assert getattr(a, count).tolist() == getattr(b, count).tolist(), count

@@ -62,6 +62,8 @@ def draw_cells(
     scales = []
     for name in style.quantities:
         if channels is None and is_rgb(cells, name):
+            if style.is_log(name):
+                raise checks.input_error("log", log, f"left out: {name} is a colour itself")
             continue
         if (name in cells and cells[name].ndim != 1) or name not in (*cells, "angle"):
             raise checks.input_error(
@@ -352,7 +354,8 @@ def colour_bar(ax: Axes, scale: Scale) -> None:
     elif scale.log:
         low, high = scale.limits
         norm, ticks = LogNorm(low, high), np.array([low, math.sqrt(low * high), high])
-        words = [f"{x:.3g}" for x in ticks] if high > 2 * low else numbers(ticks)
+        more = -math.floor(math.log10((high - low) / high))  # digits in which the ends differ
+        words = [f"{x:.{2 + more}g}" for x in ticks]
     else:
         low, high = scale.limits
         norm, ticks = Normalize(low, high), np.array([low, 0.5 * (low + high), high])
