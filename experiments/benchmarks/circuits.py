@@ -3,13 +3,17 @@
     OMP_NUM_THREADS=1 python experiments/benchmarks/circuits.py      # about five minutes
     python experiments/benchmarks/circuits.py --case "tau_leap" --colonies 64 --cells 100
     python experiments/benchmarks/circuits.py --explicit     # explicit methods against the default
+    python experiments/benchmarks/circuits.py --exchange     # a circuit with its exchange
 
 Each case is the repressilator, grown from one founder a colony to `cells` cells a colony in the
 mean. The same step of the same state is then taken by both backends in turn, so that a machine that
 does other work slows both. The table gives the least time of the whole step, of the circuit's
 solver alone, and their ratios, and whether all fields are the same to the bit. The script appends
 each run to a JSON file with its machine, versions and commit. With --explicit it steps two smooth
-circuits by the default method and by explicit ones in turn, compiled, and only prints.
+circuits by the default method and by explicit ones in turn, compiled, and only prints. With
+--exchange it prints the time of the boundary detector's circuit with its exchange, at the last of a
+run's steps: as published, stiff, and with constants drawn for each of 64 colonies from the ranges
+of a search.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ from record import machine
 import torchfilm as tf
 from torchfilm.effects.bound_circuit import BoundCircuit
 from torchfilm.effects.circuit_kernels import CircuitKernels
+from torchfilm.tools.timing import Timings
 
 DT = 0.05
 BACKENDS = ("compiled", "torch")
@@ -41,6 +46,11 @@ def scene_of(
     scene = tf.scenes.build(name)
     settings = CASES[method] if settings is None else settings
     change = {"method": method, "backend": backend, **settings}
+    return with_circuit(scene, change)
+
+
+def with_circuit(scene: tf.Scene, change: dict) -> tf.Scene:
+    """Returns the scene with other settings of its circuit."""
     return scene.replace(
         *(e._with(**change) if isinstance(e, tf.Circuit) else e for e in scene.effects)
     )
@@ -124,6 +134,50 @@ def print_explicit(name: str, options: argparse.Namespace) -> None:
         )
 
 
+# Ranges of constants, as `experiments/boundary_stripe.py` searches them.
+RANGES = {
+    "d1": (1e-3, 1.0), "k1": (0.1, 100.0), "D1": (0.1, 100.0), "d3": (1e-4, 10.0),
+    "k5": (0.1, 100.0), "k3": (0.1, 100.0), "k4": (1e-6, 1e-2), "dr": (0.1, 10.0),
+}  # fmt: skip
+
+
+def drawn_constants(colonies: int) -> dict[str, torch.Tensor]:
+    """Returns constants of each colony, evenly distributed by their logarithms."""
+    draw = torch.Generator().manual_seed(0)
+    share = torch.rand(len(RANGES), colonies, generator=draw)
+    return {
+        name: low * (high / low) ** share[k] for k, (name, (low, high)) in enumerate(RANGES.items())
+    }
+
+
+def print_exchange() -> None:
+    """Prints the time of a circuit with its exchange, by both backends in turn."""
+    sets = {
+        "100 cells, as published": (1, {}),
+        "100 cells, stiff": (1, {"k1": 50.0, "D1": 50.0}),
+        "64 x 100 cells, as published": (64, {}),
+        "64 x 100 cells, drawn": (64, drawn_constants(64)),
+    }
+    for words, (colonies, constants) in sets.items():
+        scene = tf.scenes.boundary_detector(**constants, rtol=1e-2)
+        models = {b: with_circuit(scene, {"backend": b}).bind(colonies, seed=0) for b in BACKENDS}
+        state, times = models["compiled"].start(), {b: [] for b in BACKENDS}
+        while state.cells < 100 * colonies:
+            later = models["compiled"].step(state, DT)
+            if state.cells > 60 * colonies:  # the last ten steps or so
+                for b, model in models.items():
+                    spent = Timings()
+                    model.step(state, DT, spent)
+                    times[b].append(1e3 * spent.seconds["circuit"])
+            state = later
+        least = {b: min(x) for b, x in times.items()}
+        print(
+            f"{words:<30}{state.cells:>7} cells; torch {least['torch']:8.2f} ms, compiled"
+            f" {least['compiled']:7.3f} ms, ratio {least['torch'] / least['compiled']:.0f}",
+            flush=True,
+        )
+
+
 def row(record: dict) -> str:
     """Returns a line of the printed table."""
     step, solver = record["step_ms"], record["solver_ms"]
@@ -143,12 +197,16 @@ def main() -> None:
         "--case", action="append", choices=tuple(CASES), help="one method; may be repeated"
     )
     parser.add_argument("--explicit", action="store_true")
+    parser.add_argument("--exchange", action="store_true")
     parser.add_argument("--colonies", type=int, default=64)
     parser.add_argument("--cells", type=int, default=100, help="cells a colony, in the mean")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("circuits.json"))
     options = parser.parse_args()
     tf.keep_memory()
+    if options.exchange:
+        print_exchange()
+        return
     if options.explicit:
         for name in ("toggle_switch", "repressilator"):
             print_explicit(name, options)
