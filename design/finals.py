@@ -120,8 +120,8 @@ class FreshLosses:
 def fresh_losses(
     task: Task, study: Study, sizes: Sequence[float], point: np.ndarray
 ) -> FreshLosses | None:
-    """Of a design (D,), those of the check where it was checked; None before it was grown on LEAST
-    seeds at all sizes."""
+    """Of a design (D,), those of the check where it was checked, else those of the finals; None
+    before it was grown on LEAST seeds at all sizes."""
     checked = _fresh(task, study, sizes, point, CHECK_STREAM)
     return checked or _fresh(task, study, sizes, point, FIRST_STREAM)
 

@@ -271,9 +271,10 @@ def constrained(target: Target) -> bool:
 def _least_broken(target: Target) -> float:
     """The least loss of a colony that breaks the constraints of a target. Where it is to last, that
     is a mean over steps, of which the colony breaks them in some."""
-    inside = [_least_broken(part) for part in inner_targets(target) if constrained(part)]
-    alone = Constrained.BROKEN if isinstance(target, Constrained | Spread) else 0.0
-    return min([alone, *inside]) if alone else Constrained.BROKEN / MANY
+    if not isinstance(target, Constrained | Spread):
+        return Constrained.BROKEN / MANY
+    inside = (_least_broken(part) for part in inner_targets(target) if constrained(part))
+    return min([Constrained.BROKEN, *inside])
 
 
 def in_words(bounds: Mapping[str, str]) -> str:

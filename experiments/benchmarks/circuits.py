@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from pathlib import Path
 
@@ -30,6 +31,9 @@ import torchfilm as tf
 from torchfilm.effects.bound_circuit import BoundCircuit
 from torchfilm.effects.circuit_kernels import CircuitKernels
 from torchfilm.tools.timing import Timings
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import boundary_stripe
 
 DT = 0.05
 BACKENDS = ("compiled", "torch")
@@ -134,19 +138,13 @@ def print_explicit(name: str, options: argparse.Namespace) -> None:
         )
 
 
-# Ranges of constants, as `experiments/boundary_stripe.py` searches them.
-RANGES = {
-    "d1": (1e-3, 1.0), "k1": (0.1, 100.0), "D1": (0.1, 100.0), "d3": (1e-4, 10.0),
-    "k5": (0.1, 100.0), "k3": (0.1, 100.0), "k4": (1e-6, 1e-2), "dr": (0.1, 10.0),
-}  # fmt: skip
-
-
 def drawn_constants(colonies: int) -> dict[str, torch.Tensor]:
-    """Returns constants of each colony, evenly distributed by their logarithms."""
+    """Returns constants of each colony as the search for a stripe may draw them."""
     draw = torch.Generator().manual_seed(0)
-    share = torch.rand(len(RANGES), colonies, generator=draw)
+    share = torch.rand(len(boundary_stripe.PARAMETERS), colonies, generator=draw)
     return {
-        name: low * (high / low) ** share[k] for k, (name, (low, high)) in enumerate(RANGES.items())
+        p.name: torch.tensor([p.value(x) for x in own.tolist()])
+        for p, own in zip(boundary_stripe.PARAMETERS, share, strict=True)
     }
 
 
