@@ -27,6 +27,7 @@ from fuzz_scenes import eats, mechanics, scene_of
 from torch import Tensor
 
 import torchfilm as tf
+from torchfilm.effects.mechanics_report import MechanicsReport
 
 __all__ = ["DRAWS", "PUSHING", "Beside", "Capsules", "Contacts", "Draw", "run", "scene_of"]
 
@@ -271,9 +272,16 @@ def both_paths(
             assert apart <= LOOSE, f"colony {k}: the paths differ by {apart:g} radii"
         if exact and passes and few and settings.tolerance <= 1e-6 and k not in {*failed, *lost}:
             assert apart <= TIGHT, f"colony {k}: the paths differ by {apart:g} radii"
+            assert softness_alike(fast, slow, k), f"colony {k}: the paths report other alphas"
         if int(fast.iterations[k]) or int(slow.iterations[k]):
             kind = "alike" if apart <= ALIKE[draw.dtype] else "apart"
             paths[f"{draw.dtype}, {'same' if same else 'other'} counts, {kind}"] += 1
+
+
+def softness_alike(fast: MechanicsReport, slow: MechanicsReport, colony: int) -> bool:
+    """Whether two reports of a step have the same α of a colony's contacts, to a thousandth."""
+    one, other = float(fast.alpha[colony]), float(slow.alpha[colony])
+    return math.isclose(one, other, rel_tol=1e-3)
 
 
 def difference(one: tf.State, other: tf.State) -> float:

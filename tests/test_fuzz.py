@@ -185,17 +185,21 @@ PUSHING = fuzz.Draw(
 )
 
 
-@pytest.mark.parametrize("part", ["position", "passes"])
+@pytest.mark.parametrize("part", ["position", "passes", "alpha"])
 def test_the_fuzzer_notices_that_the_paths_differ(part):
     scene, before = fuzz.scene_of(PUSHING)
     after, paths = step(scene, before, PUSHING.dt), Counter()
     fuzz.both_paths(scene, before, after, PUSHING, paths)
     assert paths == {"float64, same counts, alike": 2}
     report = after.reports["mechanics"]
-    moved = {"position": after.position + 1e-3, "reports": {"mechanics": report}}
-    more = {"reports": {"mechanics": replace(report, passes=report.passes + PASSES)}}
-    broken = after.replace(**(moved if part == "position" else more))
-    with pytest.raises(AssertionError, match=r"paths differ|too many passes"):
+    with_report = lambda **changed: {"reports": {"mechanics": replace(report, **changed)}}
+    change, words = {
+        "position": ({"position": after.position + 1e-3, **with_report()}, "paths differ"),
+        "passes": (with_report(passes=report.passes + PASSES), "too many passes"),
+        "alpha": (with_report(alpha=1.01 * report.alpha), "paths report other alphas"),
+    }[part]
+    broken = after.replace(**change)
+    with pytest.raises(AssertionError, match=words):
         fuzz.both_paths(scene, before, broken, PUSHING, paths)
 
 

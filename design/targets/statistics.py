@@ -218,7 +218,8 @@ def birth_note(state: tf.State) -> Tensor:
 
 
 def _ages(state: tf.State, history: Tensor | None) -> Tensor:
-    """The age of each cell, (N,) h; that of founders is the time since the start."""
+    """The age of each cell, (N,) h; that of founders is the time since the start, and of cells that
+    an effect adds, which have no parent either, since the step that added them."""
     if history is None:
         raise tf.InputError(
             "ages need the notes of all steps: stack target.note(state) after each of them, or"
@@ -227,7 +228,7 @@ def _ages(state: tf.State, history: Tensor | None) -> Tensor:
     times, uids = history[:, :, 0], history[:, :, 1]
     step = (uids.index_select(1, state.colony) <= state.uid).sum(0)
     born = times[step.clamp(max=len(times) - 1), state.colony]
-    return state.time - torch.where(state.parent < 0, 0.0, born)
+    return state.time - torch.where((step == 0) & (state.parent < 0), 0.0, born)
 
 
 def resampled_spread(cells: SeenCells, plan: ColonyStatistics, colony: int) -> Tensor:

@@ -11,6 +11,7 @@ from searching import grown, lit
 
 import torchfilm as tf
 from design import Objective, Observed, Parameter, Search, Task
+from design.targets.statistics import seen_cells
 
 DEGREES = {"angle_unit": "degrees"}
 
@@ -102,6 +103,17 @@ def test_ages_are_the_times_since_birth(seen):
             assert found[f"age_{q}_h"][k] == pytest.approx(np.quantile(ages, q / 100), abs=1e-9)
     with pytest.raises(tf.InputError, match="ages need the notes"):
         target.loss(state)
+
+
+def test_cells_that_an_effect_adds_are_as_old_as_since_then(seen):
+    """They have no parent, as founders have none, but a number of a later step."""
+    state, history = seen
+    plan = Observed.from_state(state, history=history).plan
+    ages = seen_cells(state, plan, history).age
+    late = ages < state.time - 0.1
+    assert late.any()
+    added = state.replace(parent=torch.where(late, -1, state.parent))
+    assert torch.equal(seen_cells(added, plan, history).age, ages)
 
 
 def test_statistics_do_not_depend_on_the_batch(seen):
