@@ -18,7 +18,7 @@ from torchfilm.initial_cells import Cells
 from torchfilm.model import Model
 from torchfilm.resolver import BoundBatch
 from torchfilm.state import Field, State
-from torchfilm.tools import checks
+from torchfilm.tools import checks, units
 from torchfilm.tools.threads import after_fork, one_torch_thread
 
 if TYPE_CHECKING:
@@ -147,9 +147,10 @@ def _declared_anew(state: State, field: Field) -> State:
 def _means_the_same(wanted: Field, state: State) -> bool:
     """Whether a field of a state is what a scene means by it: a length at which cells divide is no
     added length."""
-    about = lambda field: (field.meaning, field.unit, field.scope, field.shape)
+    about = lambda field: (field.meaning, field.scope, field.shape)
     there = state.declared.get(wanted.name)
     alike = there is not None and about(wanted) == about(there)
+    alike = alike and there is not None and not units.differ(wanted.unit, there.unit)
     return alike and state.fields[wanted.name].dtype == (wanted.dtype or state.dtype)
 
 

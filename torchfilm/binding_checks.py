@@ -16,7 +16,7 @@ from torchfilm.parameters import parameters
 from torchfilm.resolver import FirstValue
 from torchfilm.rule_views import KNOWN_FIELDS, MEANS
 from torchfilm.state import CELL, OUTSIDE, PER_CELL, Field, State
-from torchfilm.tools import checks, row_checks
+from torchfilm.tools import checks, row_checks, units
 from torchfilm.tools.hashing import trained
 from torchfilm.tools.tangents import tracked
 from torchfilm.tools.warn_once import warn
@@ -278,7 +278,7 @@ def another_quantity(there: Field, wanted: Field, kept: Sequence[str]) -> bool:
         return True
     if not there.unit or not wanted.unit:  # variables of rules, and what first cells brought
         return False
-    return there.unit != wanted.unit or (
+    return units.differ(there.unit, wanted.unit) or (
         kept.count(wanted.name) > 1 and there.meaning != wanted.meaning
     )
 

@@ -54,7 +54,7 @@ def shorten(value: object) -> str:
         inner = [
             f"{f.name}={shorten(getattr(value, f.name))}"
             for f in dataclasses.fields(value)
-            if not _same(getattr(value, f.name), f.default)
+            if f.repr and not _same(getattr(value, f.name), f.default)
         ]
         return f"{type(value).__name__}({', '.join(inner)})"
     if isinstance(value, Mapping):

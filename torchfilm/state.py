@@ -19,6 +19,7 @@ from torchfilm.state_colonies import CELL, COLONY, GRID, PER_COLONY, Arrived, En
 from torchfilm.tools import checks, displays, random, row_checks, tangents
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.read_only import read_only
+from torchfilm.tools.units import is_concentration
 
 # why cells leave a state
 FATES = ("divided", "removed", "left", "failed", "lysed", "eroded", "sloughed")
@@ -57,6 +58,10 @@ class Field(metaclass=checks.KnownKeywords):
         if not plain.isidentifier() or self.name in RESERVED:
             rule = "an identifier that the state does not use itself"
             raise checks.input_error("Field.name", self.name, rule)
+
+    @property
+    def is_concentration(self) -> bool:
+        return is_concentration(self.unit)
 
     def start(self, state: State, rows: Tensor) -> Tensor:
         """Initial values for the given rows (M,) of the state: (M, *shape)."""

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from torchfilm.state import State
 
 CELL, COLONY = "cell", "colony"
-CONCENTRATION = "conc"  # the unit of species and signals
 # The forms that a value of a cell may take, and the value of one cell type, for messages.
 FORMS = (
     "Give one number, a list with one number per colony, a dict by cell type such as {0: 0.6, 1:"

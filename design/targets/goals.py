@@ -27,7 +27,6 @@ from design.targets.base import (
 from design.targets.several import Several, SumOfTargets
 from torchfilm import checks
 
-CONCENTRATION = "conc"  # the unit of species
 MANY = 1000.0  # a mean over fewer colonies or steps shows that one of them misses constraints
 
 
@@ -50,7 +49,7 @@ class Burden(Target):
         if self.species is not None:
             return self.species
         return tuple(
-            n for n, f in state.declared.items() if (f.unit, f.scope) == (CONCENTRATION, "cell")
+            n for n, f in state.declared.items() if f.is_concentration and f.scope == "cell"
         )
 
     def check(self, state: tf.State) -> None:

@@ -136,7 +136,7 @@ class BoundCircuit(BoundEffect):
                 self._unlike(state, rows, kind, found),
                 circuit.atol if circuit.method == "rosenbrock" else None,
             )
-        check_read(circuit, seen, state)
+        check_read(circuit, seen, state, exchanged)
         warn_of_gradients(circuit, self.networks.values(), self.values.requires_grad)
         self.exchanged = exchanged
         of_networks = [n for made in self.networks.values() for n in made.signals]

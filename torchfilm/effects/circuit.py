@@ -33,6 +33,7 @@ from torchfilm.effects.circuit_checks import (
     equations_of,
     left_out,
     mass_action_constants,
+    molecules_in,
     names_of,
     no_cells_of,
     shared_fields,
@@ -43,7 +44,8 @@ from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.backends import check_backend
 from torchfilm.tools.parts import keywords
-from torchfilm.values import COLONY, CONCENTRATION, CONSTANT, Rule, ScheduledValue, Value, checked
+from torchfilm.tools.units import CONCENTRATION, checked_unit
+from torchfilm.values import COLONY, CONSTANT, Rule, ScheduledValue, Value, checked
 
 Part = run.RateFunction | Sequence[Reaction | Sequence[Reaction]]
 
@@ -65,21 +67,22 @@ class Circuit(Effect):
     reactions. species: names. initial: concentrations at the start by name, 0 without. daughters:
     "concentration", they have their parent's (the paper's way; the two new caps make both together
     smaller than it was), "amount", its molecules are shared by volume and none is lost; where
-    molecules are counted, they are always shared, by chance. replicated:
-    names of species of which each daughter has as many molecules as the parent, as of genes, which
-    are replicated before a division. method:
-    "rosenbrock" (stiff, adaptive for each cell), "euler", "midpoint", "heun2", "heun3", "rk4"
-    (`steps` equal steps), or for reactions "tau_leap" or "direct": molecule by molecule,
-    `molecules_per_unit` of them in a unit of concentration × µm³ (0.6022 for nM). rtol, atol: of
-    the adaptive method. name: of one circuit among several in a scene; its species are then the
-    fields NAME_SPECIES. shared: species of another circuit that this one reads and changes too, as
-    field names, or {name here: field}. backend: "compiled" functions of its equations (on
-    the CPU) or "torch"; by default compiled where the rates can be written as equations: see
-    `graph`. dilution: True, growth dilutes: amounts stay, concentrations are multiplied by
-    V_old/V_new; False, concentrations stay; or names, the species that growth dilutes. Circuits act
-    one after the other. Further keywords are constants of the rates:
-    each a number, one per colony, one per cell type, or a distribution drawn for each cell at birth
-    (extrinsic noise). Where rates are given by cell type, cells of other types need no constants.
+    molecules are counted, they are always shared, by chance. replicated: names of species of which
+    each daughter has as many molecules as the parent, as of genes, which are replicated before a
+    division. method: "rosenbrock" (stiff, adaptive for each cell), "euler", "midpoint", "heun2",
+    "heun3", "rk4" (`steps` equal steps), or for reactions "tau_leap" or "direct": molecule by
+    molecule, `molecules_per_unit` of them in a unit of concentration × µm³, by default those of
+    `concentration_unit`, and 1 without. rtol, atol: of the adaptive method. concentration_unit: the
+    name of the unit of all species, such as "nM", for pictures and tables. name: of one circuit
+    among several in a scene; its species are then the fields NAME_SPECIES. shared: species of
+    another circuit that this one reads and changes too, as field names, or {name here: field}.
+    backend: "compiled" functions of its equations (on the CPU) or "torch"; by default compiled
+    where the rates can be written as equations: see `graph`. dilution: True, growth dilutes:
+    amounts stay, concentrations are multiplied by V_old/V_new; False, concentrations stay; or
+    names, the species that growth dilutes. Circuits act one after the other. Further keywords are
+    constants of the rates: each a number, one per colony, one per cell type, or a distribution
+    drawn for each cell at birth (extrinsic noise). Where rates are given by cell type, cells of
+    other types need no constants.
     """
 
     rates: Mapping[int | str, Part]
@@ -96,6 +99,8 @@ class Circuit(Effect):
     shared: Mapping[str, str] = field(default_factory=dict)
     backend: str | None = None
     dilution: bool | tuple[str, ...] = True
+    # repr=False: a name alone, which does not count for a scene's digest
+    concentration_unit: str = field(default=CONCENTRATION, repr=False)
     parameters: Mapping[str, Value] = field(default_factory=dict)
 
     stage = CIRCUIT
@@ -112,11 +117,12 @@ class Circuit(Effect):
         steps: int = 1,
         rtol: float = 1e-4,
         atol: float = 1e-9,
-        molecules_per_unit: Value = 1.0,
+        molecules_per_unit: Value | None = None,
         name: str = "",
         shared: Sequence[str] | Mapping[str, str] = (),
         backend: str | None = None,
         dilution: bool | Sequence[str] = True,
+        concentration_unit: str = CONCENTRATION,
         **parameters: ScheduledValue,
     ):
         by_type: dict[int | str, Part] = (
@@ -152,9 +158,10 @@ class Circuit(Effect):
             },
             "rtol": checks.number("Circuit.rtol", rtol, above=0.0, most=0.1),
             "atol": checks.number("Circuit.atol", atol, above=0.0),
-            "molecules_per_unit": checked(
-                "Circuit.molecules_per_unit", molecules_per_unit, Rule(above=0.0, scope=COLONY)
+            "concentration_unit": (
+                unit := checked_unit("Circuit.concentration_unit", concentration_unit)
             ),
+            "molecules_per_unit": molecules_in(unit, molecules_per_unit, method),
             "parameters": {
                 n: checked(f"Circuit.{n}", v, POSITIVE if n in mass_action else CONSTANT)
                 for n, v in parameters.items()
@@ -339,7 +346,7 @@ class Circuit(Effect):
             Field(
                 self.variables[n],
                 "concentration in the cell",
-                CONCENTRATION,
+                self.concentration_unit,
                 initial=First(self, n),
                 at_division="reset" if self.variables[n] in again else "copy",
             )

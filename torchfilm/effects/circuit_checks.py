@@ -17,11 +17,11 @@ from torchfilm.circuits.graph import graph_of
 from torchfilm.circuits.names import label_of, unknown
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.signals.schedule import Schedule
-from torchfilm.state import PER_CELL, RESERVED, State
-from torchfilm.tools import checks
+from torchfilm.state import OUTSIDE, PER_CELL, RESERVED, State
+from torchfilm.tools import checks, units
 from torchfilm.tools.row_checks import check_field, is_name
 from torchfilm.tools.warn_once import warn
-from torchfilm.values import FORMS
+from torchfilm.values import COLONY, FORMS, Rule, checked, numbers
 
 STIFF, LEAP, DIRECT = "rosenbrock", "tau_leap", "direct"
 EXPLICIT = ("euler", *integrators.METHODS)
@@ -150,7 +150,7 @@ def shared_fields(given: Sequence[str] | Mapping[str, str]) -> dict[str, str]:
 
 def check_constants(given: Mapping[str, Any], options: Sequence[str]) -> None:
     for name, value in given.items():
-        near = checks.nearest(name, options)
+        near = checks.nearest(name, options) or ("concentration_unit" if name == "unit" else "")
         # a dict by names is meant for an option such as `initial`; a constant goes by cell types
         by_names = isinstance(value, Mapping) and any(isinstance(key, str) for key in value)
         function = callable(value) and not isinstance(value, Schedule)
@@ -217,6 +217,42 @@ def check_replicated(
     return names
 
 
+def molecules_in(unit: str, given: Any, method: str) -> Any:
+    """The option `molecules_per_unit`, by default that of the unit of concentrations where
+    molecules are counted, and 1 elsewhere, where nothing reads it."""
+    name, known = "Circuit.molecules_per_unit", units.MOLECULES.get(unit)
+    if given is None:
+        if method not in (LEAP, DIRECT):
+            known = None
+        elif known is None and unit in units.NAMED:
+            raise checks.InputError(
+                f"{name} is missing: how many molecules there are in 1 {unit} × µm³ depends on"
+                " their mass, or on the scale."
+            )
+        return checked(name, known or 1.0, Rule(above=0.0, scope=COLONY))
+    made = checked(name, given, Rule(above=0.0, scope=COLONY))
+    apart = 0.0 if known is None else float((numbers(made).detach() / known - 1.0).abs().max())
+    if apart > units.CLOSE:
+        rule = f"about {known:.4g} where concentration_unit = {unit!r}, which it is by default"
+        raise checks.input_error(name, given, rule, "Leave one of the two out.")
+    return made
+
+
+def _check_units(circuit: Any, exchanged: Mapping[Any, Iterable[str]], state: State) -> None:
+    """Raise InputError where a circuit and a signal that it exchanges, or a species that it shares,
+    have different units."""
+    names = dict.fromkeys(OUTSIDE + n for each in exchanged.values() for n in each)
+    for name in (*names, *circuit.shared.values()):
+        there = state.declared[name].unit
+        if units.differ(circuit.concentration_unit, there):
+            what = "exchanges the signal" if name in names else "shares the species"
+            raise checks.InputError(
+                f"{circuit.value_owner()} is in {circuit.concentration_unit}, and {what}"
+                f" {name.removeprefix(OUTSIDE)!r}, which is in {there}: nothing converts one to the"
+                " other, so that both need one unit."
+            )
+
+
 def warn_of_gradients(circuit: Any, networks: Iterable[Any], tracked: bool) -> None:
     """Warn where molecules are counted and a gradient is wanted: by values, `tracked`, or by rates
     of reactions."""
@@ -238,10 +274,15 @@ def check_levels(circuit: Any, fields: Mapping[str, Tensor], free: Container[str
             check_field(fields, name, lambda x: x < 0, "at least 0")
 
 
-def check_read(circuit: Any, seen: Mapping[str, set[str]], state: State) -> None:
-    """Raise InputError for a constant of a circuit that looks like another name; warn of one that
-    no rate reads, and of dilution that is counted twice. seen: the names that rates read, of
-    constants, "p", and of cells, "cell"."""
+def check_read(
+    circuit: Any, seen: Mapping[str, set[str]], state: State,
+    exchanged: Mapping[Any, Iterable[str]],
+) -> None:  # fmt: skip
+    """Raise InputError for a constant of a circuit that looks like another name, and for signals
+    exchanged, by cell type, in another unit; warn of a constant that no rate reads, and of
+    dilution that is counted twice. seen: the names that rates read, of constants, "p", and of
+    cells, "cell"."""
+    _check_units(circuit, exchanged, state)
     given, read = circuit.parameters, seen["p"]
     growth = state.declared.get("growth_rate")
     if circuit.dilution and "growth_rate" in seen["cell"] and growth and "1/h" in growth.unit:

@@ -15,16 +15,15 @@ from torchfilm.medium_exchange import MediumExchange
 from torchfilm.resolver import Values
 from torchfilm.signals.schedule import warn_of_means
 from torchfilm.state import CELL, OUTSIDE, State
-from torchfilm.tools import checks
+from torchfilm.tools import checks, units
 from torchfilm.tools.random import fine_uniform
 from torchfilm.tools.read_only import read_only
 from torchfilm.tools.row_checks import check_names, check_variable, is_name
-from torchfilm.values import CONCENTRATION, Rule, ScheduledValue, checked, physical
+from torchfilm.values import Rule, ScheduledValue, checked, physical
 
 AMOUNT = Rule("conc·µm³", least=0.0, scheduled=True)
 SHARE = Rule("", least=0.0, scheduled=True)
 LENGTH, VOLUME = "length", "volume"
-SUMS = (CONCENTRATION, "")  # units of species and variables, which may add up a hazard
 _NO_LEVELS = ("radius", "position", "axis", "area", "cells")
 _OF_SHAPE = (
     "a species or a variable; of a cell's shape, `when` knows length and volume, `releases` volume"
@@ -208,12 +207,29 @@ class Lysis(Effect):
     def check(self, state: State, values: Values) -> None:
         for name in self._variables():
             check_variable("Lysis", name, state, at_least_zero=name in self.at_least_zero())
-        if self.hazard is not None and (unit := state.declared[self.hazard].unit) not in SUMS:
+        own = None if self.hazard is None else state.declared[self.hazard]
+        if own is not None and own.unit and not own.is_concentration:  # no species, no variable
             raise checks.input_error(
                 "Lysis.hazard", self.hazard,
                 "a species of a circuit, or a variable of rules, that is only for it",
-                f"{self.hazard} is in {unit}, and would be 0 after each step.",
+                f"{self.hazard} is in {own.unit}, and would be 0 after each step.",
             )  # fmt: skip
+        self._check_units(state)
+
+    def _check_units(self, state: State) -> None:
+        """Raise InputError where a species goes to a signal of another unit, without a share of it,
+        which may convert it."""
+        released = {s: names for s, names in self._named.items() if s in state.signals}
+        for signal, names in released.items():
+            there = state.declared[OUTSIDE + signal].unit
+            for name in () if _has_shares((self.releases or {})[signal]) else names:
+                own = state.declared.get(name)
+                if own and own.is_concentration and units.differ(own.unit, there):
+                    raise checks.InputError(
+                        f"Lysis.releases gives {name!r}, in {own.unit}, to the signal {signal!r},"
+                        f" which is in {there}: give both one unit, or the factor between them,"
+                        f" {{{name!r}: …}}."
+                    )
 
 
 class BoundLysis(BoundEffect):
@@ -351,4 +367,4 @@ def _quantity(state: State, name: str) -> Tensor:
 def _is_species(state: State, name: str) -> bool:
     """Whether it is a concentration in each cell."""
     declared = state.declared.get(name)
-    return declared is not None and declared.scope == CELL and declared.unit == CONCENTRATION
+    return declared is not None and declared.scope == CELL and declared.is_concentration

@@ -39,7 +39,6 @@ from torchfilm.state import COLONY, GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import check_backend, why_torch
 from torchfilm.tools.parts import keywords
-from torchfilm.values import CONCENTRATION
 
 OUTSIDE_CELLS = ("error", "grow", "reservoir")
 EXCHANGES = ("turns", "together")
@@ -216,16 +215,16 @@ class Medium(Effect):
         return self.splitting == "strang"
 
     def declares(self, dim: int) -> tuple[Field, ...]:
+        unit = {n: signal.concentration_unit for n, signal in self.signals.items()}
         fields = [
-            Field(OUTSIDE + n, "signal in the medium", CONCENTRATION, scope=GRID)
-            for n in self.signals
+            Field(OUTSIDE + n, "signal in the medium", unit[n], scope=GRID) for n in self.signals
         ]
         if self.outside == "reservoir":
             # float64: after thousands of steps, a float32 sum would round away what a step adds
             meaning = "amount given to the reservoir outside the box, less what was taken"
             fields += [
-                Field(f"{n}_reservoir", meaning, "conc·µm³", scope=COLONY, dtype=torch.float64)
-                for n in self.signals
+                Field(f"{n}_reservoir", meaning, f"{x}·µm³", scope=COLONY, dtype=torch.float64)
+                for n, x in unit.items()
             ]
         return tuple(fields)
 

@@ -20,7 +20,8 @@ from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.doubling import check_doubling
 from torchfilm.tools.row_checks import check_variable
-from torchfilm.values import CONCENTRATION, Value, is_drawn, numbers, physical
+from torchfilm.tools.units import CONCENTRATION
+from torchfilm.values import Value, is_drawn, numbers, physical
 
 CONSTANTS = ("rate", "half", "growth_yield")
 STARVATION = "starvation"

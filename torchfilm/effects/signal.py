@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import torch
@@ -16,6 +16,7 @@ from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.schedule import Schedule, checked_values
 from torchfilm.signals.space import checked_flow
 from torchfilm.tools import checks
+from torchfilm.tools.units import CONCENTRATION, checked_unit
 from torchfilm.values import Distribution, PerColony, Rule, checked
 
 # A value on the grid: a number, one per colony, or a function from positions (M, 3) µm to (M,).
@@ -38,7 +39,8 @@ class Signal(metaclass=checks.KnownKeywords):
     or a function from positions (M, 3) µm to (M,). initial may be a distribution, too, such as
     `tf.Normal(1.0, 0.1)`: each voxel draws its own, by the seed. boundary, flow: faces of the box,
     and velocity, µm/h, if they differ from the medium's. reservoir: the concentration outside an
-    open box, one number or one per colony.
+    open box, one number or one per colony. concentration_unit: its name, such as "nM", for pictures
+    and tables.
 
     source, flow and reservoir, and what the faces are given, may be a `Schedule`.
     """
@@ -50,10 +52,13 @@ class Signal(metaclass=checks.KnownKeywords):
     boundary: BoundaryConditions | None = None
     flow: Flow | Schedule = None
     reservoir: checks.Value | Schedule = 0.0
+    # repr=False: a name alone, which does not count for a scene's digest
+    concentration_unit: str = field(default=CONCENTRATION, repr=False)
 
     instead: ClassVar[Mapping[str, str]] = {
         "D": "Did you mean diffusion?",
         "K": "Did you mean diffusion?",
+        "unit": "Did you mean concentration_unit?",
     }
 
     def __post_init__(self) -> None:
@@ -65,6 +70,9 @@ class Signal(metaclass=checks.KnownKeywords):
             "source": checked_values("Signal.source", self.source, _on_grid),
             "reservoir": checked_values("Signal.reservoir", self.reservoir, _number),
             "flow": velocity("Signal.flow", self.flow),
+            "concentration_unit": checked_unit(
+                "Signal.concentration_unit", self.concentration_unit
+            ),
         }
         for name, value in given.items():
             object.__setattr__(self, name, value)

@@ -14,7 +14,7 @@ from torchfilm.pictures.frames import FOUNDER, Frame, unit_of
 from torchfilm.pictures.shapes import VIEWS
 from torchfilm.state import OUTSIDE
 from torchfilm.tools import checks
-from torchfilm.values import CONCENTRATION
+from torchfilm.tools.units import is_concentration
 
 ANGLE = "angle"
 VECTORS = ("position", "axis")  # three values of a cell that are no colour
@@ -227,7 +227,7 @@ def default_colour(frame: Frame) -> str:
     types = frame.cells.get(TYPES)
     if types is not None and len(np.unique(types)) > 1:
         return TYPES
-    species = (n for n, unit in frame.units.items() if unit == CONCENTRATION and n in frame.cells)
+    species = (n for n, unit in frame.units.items() if is_concentration(unit) and n in frame.cells)
     return next(species, ANGLE)
 
 
@@ -358,7 +358,7 @@ def scale_of(
         low = max(least, FAINTEST * high)
     elif style.channels is not None and name != style.signal:
         low = min(0.0, low)  # a dark channel means a value of 0
-    limits = given or _wide_enough(low, high, NARROWEST if unit == CONCENTRATION else 0.0)
+    limits = given or _wide_enough(low, high, NARROWEST if is_concentration(unit) else 0.0)
     under, over = seen.low < limits[0], seen.high > limits[1]
     beyond: Beyond = "both" if under and over else "min" if under else "max" if over else "neither"
     return Scale(name, label, unit, _colour_map(name, style), limits, beyond, log=log)

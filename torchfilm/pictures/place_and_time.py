@@ -22,7 +22,6 @@ from torchfilm.spatial import binned_mean, checked_edges
 from torchfilm.state import OUTSIDE
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
-from torchfilm.values import CONCENTRATION
 
 Columns = Mapping[str, np.ndarray]
 
@@ -168,7 +167,5 @@ def _bins(places: np.ndarray, edges: Sequence[float] | None) -> np.ndarray:
 
 def unit_at_cells(results: Results, quantity: str) -> str:
     """The unit of a quantity of the cells, or of a signal at them; "" without."""
-    if quantity.startswith(OUTSIDE):
-        return CONCENTRATION
     declared = declared_fields(results.attributes)
     return "µm" if quantity in ("length", "radius") else str(declared.get(quantity, ["", ""])[1])

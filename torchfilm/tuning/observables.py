@@ -40,7 +40,6 @@ from torchfilm.state import State
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.timing import Timings
 from torchfilm.tuning.settings import Settings
-from torchfilm.values import CONCENTRATION
 
 # Length of the window, in steps of the scene. With half as many, the settling of the start causes
 # most of the error in volume, even in the second half (measured).
@@ -307,6 +306,4 @@ def _left_out(name: str, parts: Sequence[Tensor]) -> Tensor:
 
 def species(state: State) -> list[str]:
     """Names of the fields that are concentrations in cells."""
-    return [
-        name for name, f in state.declared.items() if f.scope == "cell" and f.unit == CONCENTRATION
-    ]
+    return [name for name, f in state.declared.items() if f.scope == "cell" and f.is_concentration]
