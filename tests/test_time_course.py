@@ -72,6 +72,7 @@ def test_colonies_that_die_leave_the_picture_and_many_have_no_bands(run):
     [
         (("gpf",), {}, "quantity = 'gpf'.*Did you mean 'gfp'"),
         (("m",), {}, "What is outside of cells is 'out.m'"),
+        ((["gfp"],), {}, r"quantity = \['gfp'\].*Several follow one another"),
         ((), {"colonies": [7]}, "colonies"),
         ((), {"most": 0}, "most"),
         ((), {"dpi": 0}, "dpi"),

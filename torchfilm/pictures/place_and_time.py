@@ -150,6 +150,9 @@ def _check_known(known: Columns, signals: Columns, wanted: Sequence[str]) -> Non
     """Raise InputError for a wanted name that no cell has. signals: at the cells, by name."""
     names = [n for n in known if n not in ("uid", "parent", "colony")]
     for quantity in wanted:
+        if not isinstance(quantity, str):
+            hint = 'Several follow one another: time_course(results, "gfp", "rfp").'
+            raise checks.input_error("quantity", quantity, "a name, as text", hint)
         if quantity not in known:
             hint = checks.suggestion(quantity, names)
             if quantity in signals:
