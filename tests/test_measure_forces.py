@@ -160,3 +160,73 @@ def test_a_wall_with_a_weight_pushes_with_the_drag(weight, given):
     (state,) = tf.simulate(scene, until=0.025, dtype=torch.float64)
     drag = (2.0 + 2 * 0.5) * float(state.position[0, 1]) / 0.025
     assert float(tf.measure.wall_forces(state, [wall]).force) == pytest.approx(drag, rel=1e-6)
+
+
+# --- cells that divide, burst or leave at the end of the step -------------------------------------
+
+
+def in_a_slit(*more, **options) -> tf.Scene:
+    """A cell that lies flat between two soft walls, 0.05 µm deep in each."""
+    walls = [tf.Plane(y=s * 0.45, facing=f"{'-' if s > 0 else '+'}y", stiffness=100.0)
+             for s in (-1, 1)]  # fmt: skip
+    mechanics = tf.Mechanics(dim=2, walls=walls, **options)
+    founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], length=2.6)
+    return tf.Scene(tf.Growth(rate=1.0), *more, mechanics, founders=founders, dt=0.025)
+
+
+@pytest.mark.parametrize("options", BACKENDS, ids=["compiled", "torch"])
+def test_forces_of_a_step_are_those_on_the_cells_before_they_divide(options):
+    """Two daughters had each the mother's force on a wall, 20 in all, and half of her pressure."""
+    whole, divides = in_a_slit(**options), in_a_slit(tf.Division(length=3.0), **options)
+    pairs = zip(*(tf.simulate(s, until=0.2, dtype=torch.float64) for s in (whole, divides)),
+                strict=True)  # fmt: skip
+    counts = set()
+    for one, two in pairs:
+        if two.cells == 2 and two.births:
+            (mother,) = tf.measure.pressure(one, whole).tolist()
+            assert tf.measure.pressure(two, divides).tolist() == [mother, mother]
+        forces = tf.measure.wall_forces(two, divides).force.flatten().tolist()
+        pressing = 2 if two.cells == 2 and not two.births else 1
+        assert forces == pytest.approx([10.0 * pressing] * 2, rel=1e-6)
+        counts.add((two.cells, bool(two.births)))
+    assert {(1, False), (2, True), (2, False)} <= counts
+
+
+@pytest.mark.parametrize("options", BACKENDS, ids=["compiled", "torch"])
+def test_forces_of_a_step_are_those_on_the_cells_before_some_burst(options):
+    box = tf.Box((-5.0, -5.0), (5.0, 5.0))
+    contacts = tf.Mechanics(dim=2, walls=[box], **options)
+    parts = tf.Growth(rate=1.0), tf.Division(length=4.0), contacts
+    grows, bursts = tf.Scene(*parts, dt=0.025), tf.Scene(*parts, tf.Lysis(rate=8.0), dt=0.025)
+    state = tf.simulate(grows, until=4.0, seed=2).last()
+    one, two = (scene.bind(state=state).step(state, 0.025) for scene in (grows, bursts))
+    assert 0 < two.cells < one.cells
+    forces = [tf.measure.wall_forces(s, scene).force for s, scene in ((one, grows), (two, bursts))]
+    assert torch.equal(*forces) and float(forces[0].sum()) > 0
+    every = dict(zip(one.uid.tolist(), tf.measure.pressure(one, grows).tolist(), strict=True))
+    left = tf.measure.pressure(two, bursts).tolist()
+    alike = [every[u] == p for u, p in zip(two.uid.tolist(), left, strict=True) if u in every]
+    assert len(alike) > 10 and all(alike)
+
+
+def test_a_cell_that_was_added_since_has_no_pressure():
+    scene = in_a_slit()
+    state = tf.simulate(scene, until=0.1).last()
+    there = tf.measure.pressure(state, scene)
+    other = state.replace(uid=state.uid + 7)
+    assert bool(there.isfinite().all()) and bool(tf.measure.pressure(other, scene).isnan().all())
+
+
+def test_levels_that_hold_cells_together_are_those_of_the_solve():
+    """A circuit's step comes after contacts. Its levels, at the end of the step, hold the cells in
+    the next one."""
+    rising = tf.Circuit(lambda u, s, p, cell: {"glue": p.rate + 0.0 * u.glue}, species="glue",
+                        initial={"glue": 1.0}, rate=[0.0, 40.0])  # fmt: skip
+    founders = tf.Cells([[-1.8, 0.0], [1.8, 0.0]], [[1.0, 0.0]] * 2, length=2.5)
+    sticky = tf.Mechanics(dim=2, adhesion=[tf.Adhesion(strength=20.0, reach=0.5, adhesin="glue")])
+    scene = tf.Scene(tf.Growth(rate=0.0), rising, sticky, founders=founders, dt=0.025)
+    model = scene.bind(2, dtype=torch.float64)
+    state = model.step(model.start(), 0.025)
+    assert float(state.glue.max()) == pytest.approx(2.0)
+    pulls = tf.measure.pressure(state, scene)
+    assert torch.equal(pulls[:2], pulls[2:]) and float(pulls[0]) < 0

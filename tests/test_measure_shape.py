@@ -145,3 +145,13 @@ def test_a_periodic_space_has_no_hull():
     for name in ("hull", "aspect_ratio"):
         with pytest.raises(tf.InputError, match=f"{name} goes by places"):
             getattr(tf.measure, name)(scene.bind().start())
+
+
+def test_the_radius_of_a_colony_counts_cells_by_their_volume():
+    """So does its centre: of a large cell and a small one both are near the large one."""
+    state = state_of([[0.0, 0.0], [6.0, 0.0]], length=[5.0, 0.0], radius=[1.0, 0.5])
+    volume = np.array([math.pi * 5.0 + 4 / 3 * math.pi, math.pi / 6])
+    centre = 6.0 * volume[1] / volume.sum()
+    square = (volume * (np.array([0.0, 6.0]) - centre) ** 2).sum() / volume.sum()
+    found = tf.measure.colony_radius(state)
+    assert found.tolist() == pytest.approx([math.sqrt(2 * square)], rel=1e-12)

@@ -26,9 +26,10 @@ if TYPE_CHECKING:
 END_ON = 1e-4  # squared sine of the angle between a cell and a force on its end
 
 
-def softness(measure: str, state: State) -> Tensor:
-    """α Δt of each cell's contacts in the last step, or in its sub-steps, (N,): a contact pushes
-    with its overlap over this."""
+def acted_on(measure: str, state: State) -> tuple[State, Tensor]:
+    """The cells on which the contacts of the last step acted, as these left them, and α Δt of each
+    one's contacts in the step, or in its sub-steps, (N,): a contact pushes with its overlap over
+    this."""
     if "contact_alpha" not in state.fields:
         raise checks.InputError(
             f"{measure}: the state has no contact_alpha, the softness of one-sided contacts:"
@@ -40,10 +41,25 @@ def softness(measure: str, state: State) -> Tensor:
             f"{measure}: the state does not say in which steps its contacts were solved."
             " Give it as a step returns it: not a first one, nor one from a file or by select."
         )
-    steps, solved = (state.groups.spread(x) for x in (report.substeps.clamp(min=1), report.alpha))
+    left: State = report.left
+    steps, solved = (left.groups.spread(x) for x in (report.substeps.clamp(min=1), report.alpha))
     # the field is for the next step, which follows the force; where α is given it is that
-    alpha = torch.where(solved > 0, solved, state.contact_alpha.double())
-    return alpha * report.dt / steps
+    alpha = torch.where(solved > 0, solved, left.contact_alpha.double())
+    return left, alpha * report.dt / steps
+
+
+def kept_by(now: State, then: State, values: Tensor) -> Tensor:
+    """What cells had earlier in a step, (M,), as its last cells have it, (N,): a daughter has her
+    mother's, and a cell that was added since, NaN."""
+    size = 1 + int(torch.cat([then.uid, now.uid, now.parent]).max()) if then.cells else 1
+    key = lambda uid: now.colony * size + uid.clamp(min=0)
+    known, order = (then.colony * size + then.uid).sort()
+    out = torch.full_like(now.length, torch.nan, dtype=values.dtype)
+    for uid in (now.parent, now.uid) if then.cells else ():
+        at = torch.searchsorted(known, key(uid)).clamp(max=len(known) - 1)
+        there = (known.index_select(0, at) == key(uid)) & (uid >= 0)
+        out = torch.where(there, values.index_select(0, order.index_select(0, at)), out)
+    return out
 
 
 @dataclass(frozen=True)
@@ -61,7 +77,7 @@ class Pushes:
 def pushed_by_walls(
     state: State, surfaces: Sequence[Any], soft: Tensor, bonds: Bonds | None
 ) -> Pushes:
-    """The pushes of walls on cells, below 0 where they pull. soft: as `softness` says, (N,)."""
+    """The pushes of walls on cells, below 0 where they pull. soft: as `acted_on` says, (N,)."""
     if not surfaces:
         none = state.uid.new_empty(0)
         return Pushes(none, soft.new_empty(0), soft.new_empty(0), none)
@@ -85,7 +101,7 @@ def pushed_by_cells(
     state: State, soft: Tensor, soft_cells: bool, bonds: Bonds | None
 ) -> tuple[Pushes, Pushes]:
     """The pushes of a contact on its first cell and on its second, below 0 where they pull. soft:
-    as `softness` says, (N,)."""
+    as `acted_on` says, (N,)."""
     axis, length, radius = state.axis.double(), state.length.double(), state.radius.double()
     apart = 0.0 if bonds is None else max(bonds.reaches)
     first, second, gap = gaps_nearby(

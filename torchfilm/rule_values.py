@@ -74,7 +74,13 @@ def as_tensor(name: str, value: Any, device: torch.device) -> Tensor:
     """The value as a tensor, or RuleError."""
     try:
         value = by_position(value)
-        return value if isinstance(value, Tensor) else torch.as_tensor(value, device=device)
+        if isinstance(value, Tensor):
+            return value
+        made = torch.as_tensor(value, device=device)
+        if made.is_floating_point() and not hasattr(value, "dtype"):
+            # Python's numbers have double precision, of which torch's default would keep half
+            made = torch.as_tensor(value, dtype=torch.float64, device=device)
+        return made
     except (TypeError, ValueError, RuntimeError) as error:
         raise RuleError(
             f"{name} = {value!r} is not allowed: it must be a number or a tensor."

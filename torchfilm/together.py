@@ -111,7 +111,7 @@ class Together:
         made, again, greedy = self._finished(state, step, outcome, fixed)
         if number < FINEST * self.medium.effect.steps:
             for name, moved in outcome.moved.items():
-                again = again | step.transport[name].coarse(moved)
+                again = again | step.transport[name].coarse(moved, outcome.released[name])
         if not bool(again.any()):
             return made
         if number >= FINEST * self.medium.effect.steps:

@@ -388,3 +388,23 @@ def test_what_is_of_all_cells_is_not_asked_of_one():
 
     with pytest.raises(tf.InputError, match=r"cells\.contact_count\(…\) outside the loop"):
         growing(tf.Rules(update)).bind().start()
+
+
+def test_numbers_that_a_rule_sets_have_the_precision_of_the_state():
+    """In float64 they were those of float32: a rate of 1.1 was 1.1 + 2.4e-8."""
+
+    def update(cells):
+        cells.growth_rate = 1.1
+        cells.level = cells.length * 0.0 + 0.1
+        cells.since = cells.time
+        cells.divide_flag = cells.length > 2.05
+
+    def divide(parent, d1, d2):
+        d1.level, d2.level = 0.1, 0.7
+
+    rules = tf.Rules(update, divide, variables={"level": 0.0, "since": 0.0})
+    scene = tf.Scene(tf.Growth(), tf.Division(), rules, dim=2, dt=0.1)
+    state = tf.simulate(scene, until=0.3, dtype=torch.float64).last()
+    assert set(state.growth_rate.tolist()) == {1.1} and state.cells == 2
+    assert state.since.tolist() == pytest.approx([0.2, 0.2], abs=1e-12)
+    assert set(state.level.tolist()) <= {0.1, 0.7}

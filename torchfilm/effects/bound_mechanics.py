@@ -197,17 +197,18 @@ class BoundMechanics(BoundEffect):
             fields["elongation"] = found.elongation
         if found.contact_alpha is not None and found.compression is not None:
             fields |= {"contact_alpha": found.contact_alpha, "compression": found.compression}
-        report = MechanicsReport(**vars(found.report), substeps=found.substeps, dt=dt)
-        if given.bonds is not None:
-            report = self._stuck(report, state, given.bonds.levels, dt)
         position = found.position
         if self.space is not None:
-            report = self._fitting(report, state, state.length.detach(), self.space)
             position = self.space.inside(position)
-        return state.with_fields(**fields).replace(
-            position=position, axis=found.axis, length=found.length,
-            reports={**state.reports, "mechanics": report},
-        )  # fmt: skip
+        left = state.with_fields(**fields).replace(
+            position=position, axis=found.axis, length=found.length
+        )
+        report = MechanicsReport(**vars(found.report), substeps=found.substeps, dt=dt, left=left)
+        if given.bonds is not None:
+            report = self._stuck(report, state, given.bonds.levels, dt)
+        if self.space is not None:
+            report = self._fitting(report, state, state.length.detach(), self.space)
+        return left.replace(reports={**state.reports, "mechanics": report})
 
     @torch.no_grad()
     def parted(self, state: State, dt: float, growth: np.ndarray, length: np.ndarray) -> State:
@@ -239,17 +240,15 @@ class BoundMechanics(BoundEffect):
             found, new["compression"] = of_contacts
             given = self._given_alpha(state, dt, substeps)
             new["contact_alpha"] = found if given is None else given
-        of_step = MechanicsReport(**vars(report), substeps=substeps, dt=dt)
+        x = x if self.space is None else self.space.inside(x)
+        left = state.with_fields(**new).replace(position=x, axis=axes, length=lengths)
+        of_step = MechanicsReport(**vars(report), substeps=substeps, dt=dt, left=left)
         if self.effect.adhesion:
             assert bonds is not None
             of_step = self._stuck(of_step, state, torch.from_numpy(bonds[0]), dt)
         if self.space is not None:
             of_step = self._fitting(of_step, state, torch.from_numpy(length), self.space)
-            x = self.space.inside(x)
-        return state.with_fields(**new).replace(
-            position=x, axis=axes, length=lengths,
-            reports={**state.reports, "mechanics": of_step},
-        )  # fmt: skip
+        return left.replace(reports={**state.reports, "mechanics": of_step})
 
     def derivatives_wanted(self, state: State) -> bool:
         """Whether gradients are required through the step. Raises InputError for forward mode."""

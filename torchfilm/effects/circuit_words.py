@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from torchfilm.circuits.compiled_gradients import MOST_DIRECTIONS
 from torchfilm.parameters import number_range
 from torchfilm.signals.compiled_uptake import EVENTS
-from torchfilm.signals.joint import COARSE
+from torchfilm.signals.joint import COARSE, LATE
 from torchfilm.values import numbers
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def together_lines(exchanges: Mapping[str, float]) -> list[str]:
         lines.append(
             f"{name}: transport by backward Euler, order 1: voxels exchange {times:.3g} times a"
             f" step, over {EVENTS:g}; in parts of a step while cells take over {100 * COARSE:g} %"
-            " of it in one"
+            f" of it in one, or {100 * LATE:g} % leave and its content changes by as much"
             if times > EVENTS
             else f"{name}: transport by a series, order 2 in dt"
         )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
@@ -38,12 +39,19 @@ HINTS = {
 }
 
 
+if TYPE_CHECKING:
+    from torchfilm.state import State
+
+
 @dataclass(frozen=True)
 class MechanicsReport(ContactReport):
-    """As `ContactReport`, with the `substeps` taken in each colony, (B,), and the step, `dt` h."""
+    """As `ContactReport`, with the `substeps` taken in each colony, (B,), and the step, `dt` h.
+    left: the cells as mechanics left them, on which the forces of the step acted: later in it some
+    divide, burst or leave."""
 
     substeps: Tensor
     dt: float
+    left: State = field(repr=False)
 
     @property
     def hint(self) -> str:

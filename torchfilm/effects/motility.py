@@ -149,7 +149,11 @@ class Motility(Effect):
     def numerics(self, dt: float, state: State) -> list[str]:
         lines = ["before contacts, which part those that meet"]
         if self.reversals is not None:
-            lines.append("reversals: by a draw of (1 − exp(−2·rate·dt))/2 at the start of a step")
+            lines.append(
+                "reversals: by a draw of (1 − exp(−2·rate·dt))/2 at the start of a step"
+                + "; of first order in dt where their factor goes by the way a cell moves"
+                * (self.reversal_factor is not None)
+            )
         if self.turning is not None:
             lines.append("turning: by a normal draw of the angle, of variance 2·turning·dt")
         return lines

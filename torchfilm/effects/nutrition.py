@@ -69,10 +69,11 @@ class Monod(Effect):
     `starvation`, 1/h, by which tf.Lysis(when="starvation", …), rules and circuits may go.
 
     Uptake and transport of the nutrient are solved together: also where a cell would empty the
-    voxels about it many times in a step, diffusion feeds it. The medium loses exactly what the
-    cells take up, and never more than it contains. A cell grows over the step at the mean
-    concentration that it finds. If contacts slow this growth, the nutrient is consumed all the
-    same. So is the nutrient for the volume of the caps lost at division.
+    voxels about it many times in a step, diffusion feeds it. The medium loses what the cells take
+    up, to rounding (in float32 up to a hundredth of it over a run, of stocks hundreds of times as
+    large), and never more than it contains. A cell grows over the step at the mean concentration
+    that it finds. If contacts slow this growth, the nutrient is consumed all the same. So is the
+    nutrient for the volume of the caps lost at division.
     """
 
     signal: str

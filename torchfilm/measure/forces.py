@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchfilm.contact_forces import bonds_of, pushed_by_cells, pushed_by_walls, softness
+from torchfilm.contact_forces import acted_on, bonds_of, kept_by, pushed_by_cells, pushed_by_walls
 from torchfilm.measure.of_a_state import of_a_state
 from torchfilm.physics.nearby import gaps_nearby
 from torchfilm.physics.surfaces import FlatSurface
@@ -79,7 +79,8 @@ class WallForces:
 @of_a_state
 @torch.no_grad()
 def wall_forces(state: State, walls: Sequence[Wall] | Scene) -> WallForces:
-    """The forces on walls in the last step, by one-sided contacts.
+    """The forces on walls in the last step, by one-sided contacts, of cells as they were before
+    some divided, burst or left at its end.
 
     A contact pushes with its overlap / (α Δt), on a soft wall with its overlap × stiffness. Divide
     by the length of a wall (2-D) or its area for the pressure, averaged over steps: one step's is
@@ -89,15 +90,16 @@ def wall_forces(state: State, walls: Sequence[Wall] | Scene) -> WallForces:
     """
     from torchfilm.scene import Scene  # it imports rooms that measure
 
-    if isinstance(walls, Scene):
-        bonds, surfaces = bonds_of(state, walls), walls.wall_surfaces()
-    else:
+    if not isinstance(walls, Scene):
         _check_walls("wall_forces", walls)
+    left, soft = acted_on("wall_forces", state)
+    if isinstance(walls, Scene):
+        bonds, surfaces = bonds_of(left, walls), walls.wall_surfaces()
+    else:
         bonds, surfaces = None, [s for wall in walls for s in wall.surfaces(state.dim)]
-    soft = softness("wall_forces", state)
-    pushes = pushed_by_walls(state, surfaces, soft, bonds)
+    pushes = pushed_by_walls(left, surfaces, soft, bonds)
     assert pushes.surface is not None
-    at = state.colony.index_select(0, pushes.cell) * len(surfaces) + pushes.surface
+    at = left.colony.index_select(0, pushes.cell) * len(surfaces) + pushes.surface
     force = Groups(at, state.colonies * len(surfaces)).sum(pushes.force.unsqueeze(1))
     facing = tuple(s.normal if isinstance(s, FlatSurface) else None for s in surfaces)
     return WallForces(force.view(state.colonies, len(surfaces)), facing)
@@ -116,8 +118,9 @@ def pressure(state: State, scene: Scene) -> Tensor:
     over the share of the chamber that the cells fill. Overlaps give the forces with an error that
     falls with dt, since cells grow, are pushed back and slide past one another within a step: in a
     full chamber they are 3 to 5 % too small at 0.025 h, 0.5 % at 0.00625 h; in a colony that
-    expands 10 to 16 % and 2 to 5 %. Adhesion pulls: where it does so more than contacts push, the
-    pressure is below 0. Bonds that broke in this step do not count.
+    expands 10 to 16 % and 2 to 5 %. A cell that was born in this step has its mother's, on which
+    the forces acted; one that was added since, NaN. Adhesion pulls: where it does so more than
+    contacts push, the pressure is below 0. Bonds that broke in this step do not count.
 
     Raises InputError for bilateral contacts, and for a state that is not as a step returned it: it
     lacks the step and the number of sub-steps.
@@ -126,15 +129,16 @@ def pressure(state: State, scene: Scene) -> Tensor:
 
     if not isinstance(scene, Scene):
         raise checks.input_error("pressure(scene)", scene, "the tf.Scene of the state")
-    soft = softness("pressure", state)
+    left, soft = acted_on("pressure", state)
     surfaces = scene.wall_surfaces()
     soft_cells = any(e.soft_contacts for e in scene.effects)
     total = torch.zeros_like(soft)
-    bonds = bonds_of(state, scene)
-    at_walls = pushed_by_walls(state, surfaces, soft, bonds)
-    for pushes in (*pushed_by_cells(state, soft, soft_cells, bonds), at_walls):
+    bonds = bonds_of(left, scene)
+    at_walls = pushed_by_walls(left, surfaces, soft, bonds)
+    for pushes in (*pushed_by_cells(left, soft, soft_cells, bonds), at_walls):
         virial = (pushes.force * pushes.arm).unsqueeze(1)
-        total = total + Groups(pushes.cell, state.cells).sum(virial).squeeze(1)
-    length, radius = state.length.double(), state.radius.double()
+        total = total + Groups(pushes.cell, left.cells).sum(virial).squeeze(1)
+    length, radius = left.length.double(), left.radius.double()
     from_above = 2 * radius * length + torch.pi * radius**2
-    return total / (2 * from_above if state.dim == 2 else 3 * state.volume.double())
+    found = total / (2 * from_above if state.dim == 2 else 3 * left.volume.double())
+    return kept_by(state, left, found)

@@ -26,11 +26,14 @@ def colony_centre(state: State) -> Tensor:
 def colony_radius(state: State) -> Tensor:
     """Radius of the disc with the same second moment as the cells, (B,) µm: √2 · RMS distance.
 
-    The distance is from the colony's centre in the x–y plane.
+    The distance is from the colony's centre in the x–y plane, and cells count by their volume, in
+    both; each as if all of it were in its middle.
     """
     from_centre = (state.position - colony_centre(state).index_select(0, state.colony))[:, :2]
-    square = (from_centre * from_centre).sum(1, keepdim=True)
-    mean = 2.0 * state.groups.sum(square).squeeze(1) / state.counts
+    volume = state.volume.double()
+    square = (from_centre * from_centre).sum(1) * volume
+    sums = state.groups.sum(torch.stack([square, volume], 1))
+    mean = 2.0 * sums[:, 0] / sums[:, 1]
     return torch.where(state.counts == 0, torch.nan, safe_sqrt(mean))
 
 

@@ -34,6 +34,9 @@ EMPTY = 1e15
 # What all cells of a colony may take of a signal by one step of backward Euler: in a closed box
 # half of that is left too much, so that what is left after a fall by e is 1 % off.
 COARSE = 0.02
+# What may leave a colony's grid in such a step, to cells, by decay and through faces, where the
+# content changes by as much: a colony's own growth is less, and its signal late by half of that.
+LATE = 0.04
 
 
 class JointMove(NamedTuple):
@@ -181,10 +184,11 @@ class JointTransport:
         end = end * kept.index_select(0, self.grid.owner)
         return end, (missing - content).clamp(min=0.0), left
 
-    def coarse(self, moved: JointMove) -> Tensor:
+    def coarse(self, moved: JointMove, released: Tensor) -> Tensor:
         """The colonies, (B,) bool, for which the step is too long: they took backward Euler, whose
-        error is half the share that cells took times the share by which the content changed, and
-        these are more than COARSE, in the geometric mean."""
+        error is half the share that left times the share by which the content changed, a step.
+        Of what cells took both are more than COARSE, in the geometric mean; or of all that left,
+        by decay and through faces too, each is more than LATE. released: (N,), conc·µm³."""
         far = torch.zeros(self.groups.size, dtype=torch.bool, device=self.field.device)
         for batch, own in zip(self.grid.batches, self._far, strict=True):
             far[batch.colonies] = torch.as_tensor(own, device=far.device)
@@ -195,8 +199,21 @@ class JointTransport:
         before, after = (of_grids.sum(fields) * self.grid.voxel_volume).unbind(1)
         taken = self.groups.sum(both(moved.taken.detach())[0])
         nothing = self.finest * self.grid.voxel_volume * of_grids.counts
-        products = taken * (after - before).abs()
-        return far & (products > COARSE**2 * after * before) & (before > nothing)
+        change = (after - before).abs()
+        given = torch.where(self.fed, both(released.detach())[0].double().clamp(min=0.0), 0.0)
+        left = self.groups.sum(given) + self._entered() - (after - before)
+        eaten = taken * change > COARSE**2 * after * before
+        late = torch.minimum(left, change).clamp(min=0.0) ** 2 > LATE**2 * after * before
+        return far & (eaten | late) & (before > nothing)
+
+    def _entered(self) -> Tensor:
+        """What came from sources and through faces, (B,), conc·µm³."""
+        found = torch.zeros(self.groups.size, dtype=torch.float64, device=self.field.device)
+        for one, batch in zip(self.carried, self.grid.batches, strict=True):
+            gain = both(x.detach())[0] if (x := one.operator.gain) is not None else None
+            if gain is not None:
+                found[batch.colonies] = gain.sum((1, 2, 3)).expand(len(batch.colonies))
+        return found * (self.grid.voxel_volume * self.dt)
 
     def _spread(self, per_cell: Tensor) -> Tensor:
         """(N,) to the voxels."""
