@@ -21,7 +21,7 @@ from torchfilm.rule_values import (
     check_integers,
     near_name,
 )
-from torchfilm.state import CELL, CELL_TYPE, COLONY, OUTSIDE, Field, State
+from torchfilm.state import CELL, CELL_TYPE, COLONY, OUTSIDE, RESERVED, Field, State
 from torchfilm.tools.hot_reload import unchanged
 
 # The paper's names (Table 1) and ours.
@@ -234,19 +234,28 @@ class CellsView(StepDraws, SurroundingsView):
             )
             dtype = state.dtype if plain else tensor.dtype
         if self._declaring and name not in (*state.fields, *KNOWN_FIELDS, "remove_flag"):
-            if name in OF_EFFECTS:
-                raise RuleError(f"cells.{name} acts only with {OF_EFFECTS[name]} in the scene.")
-            known = [*state.fields, *KNOWN_FIELDS, "remove_flag", *PAPER_NAMES]
-            near = difflib.get_close_matches(name, known, 1, cutoff=0.82)
-            if near:
-                raise RuleError(
-                    f"cells.{name} is new: did you mean {near[0]!r}? If it is a variable of your"
-                    f" own, give Rules(…, variables={{{name!r}: 0.0}})."
-                )
+            self._check_new(name)
         self._written.add(name)
         own = declared.shape if name in state.fields and declared else tuple(tensor.shape[1:])
         shape = (state.cells, *own)
         self._work[name] = broadcast_copy(f"cells.{name}", tensor.to(state.device), dtype, shape)
+
+    def _check_new(self, name: str) -> None:
+        """Raises RuleError for a new name that no variable may have, or that is a slip."""
+        if name in OF_EFFECTS:
+            raise RuleError(f"cells.{name} acts only with {OF_EFFECTS[name]} in the scene.")
+        known = [*self._state.fields, *KNOWN_FIELDS, "remove_flag", *PAPER_NAMES]
+        if name in RESERVED:
+            raise RuleError(
+                f"cells.{name} cannot be set: the state uses this name itself."
+                f"{near_name(name, known)} Give a variable of your own another name."
+            )
+        near = difflib.get_close_matches(name, known, 1, cutoff=0.82)
+        if near:
+            raise RuleError(
+                f"cells.{name} is new: did you mean {near[0]!r}? If it is a variable of your"
+                f" own, give Rules(…, variables={{{name!r}: 0.0}})."
+            )
 
     def __iter__(self):
         return (CellView(self, k) for k in range(self._state.cells))

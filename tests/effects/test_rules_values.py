@@ -306,6 +306,20 @@ def test_a_flag_is_true_or_false_and_no_probability(flag, number):
             scene.bind().start()
 
 
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [("remove", r"Did you mean 'remove_flag'\? Give"), ("take", "itself. Give a variable of your")],
+)
+def test_a_name_of_the_state_is_no_variable(name, hint):
+    def one_by_one(cells):
+        for cell in cells:
+            setattr(cell, name, True)
+
+    for rule in (lambda cells: setattr(cells, name, cells.length > 3), one_by_one):
+        with pytest.raises(tf.InputError, match=rf"cells\.{name} cannot be set: the state.*{hint}"):
+            growing(tf.Rules(rule)).bind().start()
+
+
 def test_a_colony_counts_the_cells_of_a_condition():
     seen = {}
 
