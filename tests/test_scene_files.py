@@ -289,6 +289,36 @@ def test_bad_input_in_a_scene_file_says_where(tmp_path, growth, words):
         load_scene(str(path), {})
 
 
+@pytest.mark.parametrize(
+    ("value", "own"),
+    [("0.25,0.5", "list(share)"), ("[0.25,0.5]", "share"), ("PerColony([0.25,0.5])", "share")],
+)
+def test_arithmetic_of_a_file_takes_one_number(folder, command, value, own):
+    """Several values are one per colony. What the message says to write instead, works."""
+    head = "import torchfilm as tf\ndef scene(rate=1.0, share=0.5):\n    "
+    tail = ", dim=2, dt=0.1)\n"
+    alone = "cells = tf.inoculum(int(8 * (1 - share)), radius=9.0)\n"
+    made = "    return tf.Scene(tf.Growth(rate=rate), founders="
+    (folder / "alone.py").write_text(head + alone + made + "cells" + tail)
+    with pytest.raises(SystemExit) as caught:
+        command("run", "alone.py", "--set", "rate=[1,2]", f"share={value}", "--until", 0.1)
+    said = str(caught.value.code)
+    fix = f"tf.Founders(function, share={own})"
+    assert "alone.py: share = " in said and "one number" in said and "(line 3): unsuppo" in said
+    assert "0.25, 0.5" in said and "one per colony" in said and f"founders={fix}" in said
+    function = "def function(seed, share):\n        return tf.inoculum(int(8 * (1 - share)), 9.0)\n"
+    (folder / "apart.py").write_text(head + function + made + fix + tail)
+    command("run", "apart.py", "--set", "rate=[1,2]", f"share={value}", "--until", 0.1)
+    with tf.Results("apart.h5") as results:
+        assert results.counts[0].tolist() == [6, 4]
+
+
+def test_other_errors_of_a_file_stay_as_they_are(folder):
+    (folder / "mine.py").write_text("def scene(rate):\n    return len(3)\n")
+    with pytest.raises(TypeError, match="object of type 'int' has no len"):
+        load_scene("mine.py", {"rate": (1.0, 2.0)})
+
+
 def test_a_scene_file_may_be_called_as_a_module_is(tmp_path):
     path = tmp_path / "math.py"
     path.write_text(

@@ -7,6 +7,7 @@ import inspect
 import json
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from torchfilm.scenes.recipes import parse_value, to_plain
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.load_module import run_file
+from torchfilm.values import PerColony
 
 # What a file with this suffix probably is, and how to use it.
 KNOWN_SUFFIXES = {
@@ -75,7 +77,7 @@ def _scene_of_file(
     if function is not None:
         _check_own(made, function, path, what)
     if callable(made) and not isinstance(made, Scene):
-        made = _call(made, f"{name}(…) in {what}", parameters)
+        made = _call_own(made, f"{name}(…) in {what}", parameters, path)
     elif parameters:
         raise checks.input_error(
             "--set",
@@ -136,15 +138,17 @@ def _run_scene_file(path: Path, what: str) -> dict[str, Any]:
     try:
         return run_file(path)
     except Exception as error:
-        lines = [
-            frame.lineno
-            for frame in traceback.extract_tb(error.__traceback__)
-            if frame.filename == str(path)
-        ]
-        at = f" (line {lines[-1]})" if lines else ""
+        at = _line(error, path)
         if isinstance(error, InputError):
             raise InputError(f"{what}{at}: {error}") from error
         raise InputError(f"{what} cannot be run: {type(error).__name__}: {error}{at}") from error
+
+
+def _line(error: Exception, path: Path) -> str:
+    """The last line of a file on the way to an error, as " (line 3)"; "" where none is."""
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if frame.filename == str(path)]
+    return f" (line {lines[-1]})" if lines else ""
 
 
 def _check_own(made: Any, function: str, path: Path, what: str) -> None:
@@ -168,6 +172,43 @@ def _call(make: Callable[..., Any], name: str, parameters: dict[str, Any]) -> An
         said += f" Its parameters are {signature}; give them with --set, or defaults."
         raise InputError(said) from error
     return make(**parameters)
+
+
+def _call_own(make: Callable[..., Any], name: str, parameters: dict[str, Any], path: Path) -> Any:
+    """As `_call`, for a function of a user's file. Raises InputError also where it computes with
+    several values, one per colony, as with one number."""
+    try:
+        return _call(make, name, parameters)
+    except TypeError as error:
+        several = {n: x for n, x in parameters.items() if isinstance(x, (list, tuple, PerColony))}
+        values = {n: x.values if isinstance(x, PerColony) else x for n, x in several.items()}
+        alone = {n: x[0] for n, x in values.items() if len(x)}
+        if not alone or not _works(make, {**parameters, **alone}):
+            raise
+        first = next(
+            (n for n in alone if not _works(make, {**parameters, **alone, n: several[n]})),
+            next(iter(alone)),
+        )
+        own = f"list({first})" if isinstance(several[first], tuple) else first
+        raise checks.input_error(
+            f"{name}: {first}",
+            values[first],
+            f"one number, since the function computes with it{_line(error, path)}: {error}",
+            "Several values are one per colony, which effects take as they are. For founders that"
+            f" differ between colonies write founders=tf.Founders(function, {first}={own}), with a"
+            f" function(seed, {first}).",
+        ) from error
+
+
+def _works(make: Callable[..., Any], parameters: dict[str, Any]) -> bool:
+    """Whether a function takes these parameters; a trial, which warns of nothing."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            make(**parameters)
+    except Exception:  # whatever the user's function raises
+        return False
+    return True
 
 
 def design(what: str) -> dict[str, Any]:
