@@ -44,6 +44,13 @@ def test_start_from_a_label_image(command):
     assert (first["length"] + 2 * first["radius"]).tolist() == pytest.approx([3.0, 3.0], rel=0.15)
 
 
+def test_columns_in_capitals_are_renamed(command, tmp_path):
+    """The command line has no option for names of columns."""
+    (tmp_path / "cells.csv").write_text("X,Y,angle_rad,length_um\n0,0,0,2\n")
+    with pytest.raises(SystemExit, match=r"case count: rename X, Y to x, y\.$"):
+        command("run", "microcolony", "--start", "cells.csv", "--until", 0.05)
+
+
 def test_the_version(command, capsys):
     command("--version")
     assert capsys.readouterr().out == f"torchfilm {tf.__version__}\n"

@@ -340,6 +340,22 @@ BAD = {
     "two radii": ({**ONE, "width_um": [1.0]}, {"radius": 0.5}, r"width and radius= both"),
     "negative radius": (ONE, {"radius": -0.5}, r"radius = -0\.5"),
     "a name that the table lacks": (ONE, {"columns": {"x": "cx"}}, r"lacks the column 'cx'"),
+    "of ImageJ": (
+        {n: [1.0] for n in ("X", "Y", "Angle", "Major", "Minor")},
+        {},
+        r"lacks the column 'x'.*case count: rename X, Y, Angle to x, y, angle, or give columns="
+        r"\{'x': 'X', 'y': 'Y', 'angle': 'Angle'\}\.",
+    ),
+    "an angle in capitals": (
+        {"x_um": [0.0], "y_um": [0.0], "length_um": [1.0], "ANGLE_RAD": [0.0]},
+        {},
+        r"direction: .*rename ANGLE_RAD to angle_rad, or give columns=\{'angle': 'ANGLE_RAD'\}",
+    ),
+    "a field in capitals": (
+        {**ONE, "GFP": [1.0]},
+        {"fields": ["gfp"]},
+        r"lacks the column 'gfp'.*Did you mean 'GFP'\? Upper and lower case count",
+    ),
     "a quantity that is none": (ONE, {"columns": {"xx": "x"}}, r"columns = 'xx'.*'x'"),
     "a program that is none": (ONE, {"columns": "delta"}, r"columns = 'delta'.*'skimage'"),
     "columns of another kind": (ONE, {"columns": ["x"]}, r"names of columns by quantity"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,6 +28,7 @@ IN_A_SHELL = (
     ('angle_unit="degrees"', "--angle-unit degrees"),
     ('angle_unit="radians"', "--angle-unit radians"),
 )
+NOT_IN_A_SHELL = re.compile(r", or give columns=\{.*\}")
 
 
 @dataclass
@@ -60,6 +62,7 @@ class StartCells:
             said = str(error)
             for words, option in IN_A_SHELL:
                 said = said.replace(words, option)
+            said = NOT_IN_A_SHELL.sub("", said)
             raise InputError(said) from error
 
     def print_notes(self, cells: Cells | None, model: Model) -> None:

@@ -243,7 +243,8 @@ def _check_complete(table: Table, found: Mapping[str, np.ndarray]) -> None:
     for name in ("x", "y", "length"):
         if name not in found:
             other = matching(tuple(table.columns))
-            raise table.missing(name, f"They look like columns={other[0]!r}." if other else "")
+            looks = f"They look like columns={other[0]!r}." if other else ""
+            raise table.missing(name, looks or table.in_other_case(KINDS))
 
 
 def _direction(
@@ -269,7 +270,7 @@ def _direction(
     if not all(n in found for n in AXIS[:dim]):
         raise checks.InputError(
             f"{table.source} lacks the cells' direction: give the column 'angle', or"
-            f" {', '.join(AXIS[:dim])}."
+            f" {', '.join(AXIS[:dim])}. {table.in_other_case(KINDS)}".rstrip()
         )
     axis = np.stack([found[n] for n in AXIS[:dim]], 1)
     axis[:, 1] *= sign

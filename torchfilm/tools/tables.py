@@ -255,10 +255,30 @@ class Table:
     def missing(self, column: str, hint: str = "") -> checks.InputError:
         """The error for a column that the table lacks; raise what this returns."""
         near = checks.nearest(column, self.columns)
+        cased = next((n for n in self.columns if n.lower() == column.lower()), None)
+        if not hint and cased:
+            hint = f"Did you mean {cased!r}? Upper and lower case count."
         hint = hint or (f"Did you mean {near!r}?" if near else "")
         return checks.InputError(
             f"{self.source} lacks the column {column!r}; it has {', '.join(self.columns)}."
             + (f" {hint}" if hint else "")
+        )
+
+    def in_other_case(self, kinds: Mapping[str, str]) -> str:
+        """A hint at columns whose names differ from those of quantities only in upper and lower
+        case; "" where there are none. kinds: of `UNITS`, by name of quantity."""
+        spelt = {
+            name + end: name
+            for name, kind in kinds.items()
+            for end in ("", *(f"_{unit}" for unit in UNITS[kind]))
+        }
+        cased = [n for n in self.columns if n.lower() in spelt and n not in spelt]
+        if not cased:
+            return ""
+        columns = {spelt[n.lower()]: n for n in cased}
+        return (
+            f"Upper and lower case count: rename {', '.join(cased)} to"
+            f" {', '.join(n.lower() for n in cased)}, or give columns={columns!r}."
         )
 
 
