@@ -177,3 +177,10 @@ def test_derivatives_reach_the_pixels_of_a_source_and_of_a_rule():
     end = tf.rollout(shone_on(field).bind(dtype=torch.float64), until=0.1)
     (slope,) = torch.autograd.grad(end.light[1], pixels)
     assert slope.tolist() == [[0.0, 0.5], [0.0, 0.5]]
+
+
+@pytest.mark.parametrize("of", ["initial", "source", "decay"])
+def test_an_image_as_the_value_of_a_signal_is_to_be_a_field(of):
+    for image in (STRIPES, np.ones((2, 3)), [[1.0, 2.0], [3.0, 4.0]]):
+        with pytest.raises(tf.InputError, match=rf"Signal\.{of} = .*function.*tf\.ImageField\("):
+            tf.Signal(diffusion=1.0, **{of: image})

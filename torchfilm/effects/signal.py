@@ -138,7 +138,15 @@ def _initial(name: str, given: Any) -> OnGrid:
 
 def _on_grid(name: str, given: Any) -> OnGrid:
     # a schedule can be called, too, but not with positions
-    return given if callable(given) and not isinstance(given, Schedule) else _number(name, given)
+    if callable(given) and not isinstance(given, Schedule):
+        return given
+    rows = isinstance(given, (list, tuple)) and given and isinstance(given[0], (list, tuple))
+    if rows or getattr(given, "ndim", 0) == 2:
+        shown = f"{len(given)} rows of numbers"
+        rule = "one number, one per colony, or a function of positions"
+        hint = "An image is such a function: tf.ImageField(pixels, size=(64.0, 48.0)), size in µm."
+        raise checks.input_error(name, shown, rule, hint)
+    return _number(name, given)
 
 
 def velocity(name: str, given: Any) -> Any:
