@@ -337,6 +337,20 @@ def test_what_only_tables_have_is_not_taken_for_a_slip(colour, hint):
         tf.show(state, colour=colour)
 
 
+def test_the_colours_of_a_file_include_the_lines_of_descent(tmp_path):
+    path, scene = tmp_path / "a.h5", tf.Scene(tf.Growth(rate=1.0), dim=2, dt=0.1)
+    state = tf.simulate(scene, until=0.1, record=path).last()
+    for draw in (tf.show, tf.pictures.strip):
+        with pytest.raises(tf.InputError, match=r"colour = 'x'.*'angle' or one of .*, founder\.$"):
+            draw(path, colour="x")
+    with pytest.raises(tf.InputError, match="Did you mean 'founder'"):
+        tf.show(path, colour="founders")
+    with pytest.raises(tf.InputError, match=r"one of (?!.*founder)"):
+        tf.show(state, colour="x")
+    with pytest.raises(tf.InputError, match=r"channels = 'x'.*one of (?!.*founder)"):
+        tf.show(path, channels={"x": "cyan"})
+
+
 def test_values_of_ones_own_colour_the_cells(tmp_path):
     """As tensors, arrays or lists; the first by default. NaN is grey."""
     *_, state = tf.simulate(tf.scenes.microcolony(), cells=2)

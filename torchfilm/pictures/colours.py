@@ -200,7 +200,7 @@ class PlotStyle:
                 raise checks.input_error("log", self.log, f"left out: {name} is a colour itself")
         known = [n for n, v in frame.cells.items() if v.ndim == 1]
         if self.channels is None:
-            known += [n for n in frame.cells if is_rgb(frame.cells, n)]
+            known += [*(n for n in frame.cells if is_rgb(frame.cells, n)), *frame.if_asked]
         for name in self.quantities:
             if name not in known and not (name == ANGLE and self.channels is None):
                 what = "colour" if self.channels is None else "channels"

@@ -35,6 +35,8 @@ class Frame:
     space, (low, high) µm by axis. internal: the quantities that serve the numerics, which messages
     do not list. names: of the colonies, (B,), for titles; by default their ids. solid: where the
     obstacles of a medium are, one array (nx, ny, nz) bool per colony; empty without them.
+    if_asked: what colours cells besides their quantities, and is worked out only where it is asked
+    for.
     """
 
     cells: Mapping[str, np.ndarray]
@@ -51,6 +53,7 @@ class Frame:
     internal: Collection[str] = ()
     names: Sequence[str] | None = None
     solid: Sequence[np.ndarray] = ()
+    if_asked: Collection[str] = ()
 
     def name(self, place: int) -> str:
         """What a title calls the colony at this index of the batch."""
@@ -149,6 +152,7 @@ class RecordedFrames(Sequence[Frame]):
         if self.colour == FOUNDER and FOUNDER not in cells:
             rows = self._lineage.rows(ids[cells["colony"]], cells["uid"])
             cells = {**cells, FOUNDER: colours_by_number(self._lineage.founder[rows])}
+        if_asked = () if FOUNDER in cells else (FOUNDER,)
         if not results.signal_names:
             return Frame(
                 cells,
@@ -159,6 +163,7 @@ class RecordedFrames(Sequence[Frame]):
                 faces=self.faces,
                 internal=results.internal_fields,
                 names=_named(results.parameters(place)),
+                if_asked=if_asked,
             )
         origin, shape, spacing = results.grid(place)
         signals = {} if self.signal is None else {self.signal: results.signal(self.signal, place)}
@@ -178,6 +183,7 @@ class RecordedFrames(Sequence[Frame]):
             results.internal_fields,
             _named(results.parameters(place)),
             _solid(self._obstacles, shape),
+            if_asked,
         )
 
     @cached_property
