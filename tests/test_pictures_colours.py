@@ -327,6 +327,20 @@ def test_the_range_of_a_concentration_spans_a_hundredth(values, limits):
     assert found.beyond == "neither"
 
 
+@pytest.mark.parametrize("values", [[0.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+def test_a_switch_has_one_scale_whether_it_is_on_or_off(values):
+    """Pictures of it can be compared. It has no unit, as variables of rules; a length is none."""
+    found = Drawn(frame([[0, 0], [4, 0]], on=values), colour="on")
+    (scale,) = found.layout.scales
+    assert scale.limits == (0.0, 1.0) and scale.beyond == "neither"
+    assert found.at(4, 0) == pytest.approx(viridis(values[1]), abs=NEAR)
+    seen = ValueRange()
+    seen.add(np.array([1.0]))
+    style = PlotStyle(colour="on", log=True)
+    assert scale_of("on", seen, style, {}).limits == (0.5, 1.5)
+    assert scale_of("length", seen, PlotStyle(colour="length"), {}).limits == (0.5, 1.5)
+
+
 @pytest.mark.parametrize(
     ("colour", "hint"),
     [("age", "Tables and ParaView have it"), ("out.ahl", "drawn by background='ahl'")],

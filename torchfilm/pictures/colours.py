@@ -353,6 +353,7 @@ def scale_of(
             kinds=tuple(sorted(seen.kinds)),
         )
     low, high = (seen.low, seen.high) if seen.low <= seen.high else (0.0, 1.0)
+    low = 0.0 if low == high == 1.0 and not unit else low  # a switch that is on in all cells
     if log:
         high, least = (seen.high, seen.least) if seen.high > 0 else (1.0, 0.0)
         low = max(least, FAINTEST * high)
