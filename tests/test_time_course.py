@@ -67,6 +67,35 @@ def test_colonies_that_die_leave_the_picture_and_many_have_no_bands(run):
     assert "first 2 of 5 colonies" in two.figure._suptitle.get_text()
 
 
+def kills(cells):
+    cells.remove_flag = (cells.time > 0.55) & (cells.cell_type == 1)
+
+
+@pytest.mark.parametrize(("stay", "scale"), [(1, "linear"), (30, "symlog")])
+def test_cells_that_die_out_are_marked_at_0_and_the_run_is_shown_to_its_end(tmp_path, stay, scale):
+    """Of two types in two colonies, type 1 is gone at 0.7 h; colony 1 had no other."""
+    path = tmp_path / "run.h5"
+    cells = tf.Cells([[3.0 * k, 0.0] for k in range(stay + 2)], [1.0, 0.0],
+                     cell_type=[0] * stay + [1, 1], colony=[0] * (stay + 1) + [1])  # fmt: skip
+    scene = tf.Scene(tf.Rules(kills), founders=cells, dim=2, dt=0.1)
+    tf.simulate(scene, until=2.0, record=tf.Recorder(path, scene, every=1)).last()
+    with tf.Results(path) as results:
+        first = float(results.times[results.counts[:, 1] == 0][0])
+    assert first == pytest.approx(0.7)
+    for options, died in (({"by": "cell_type"}, 2), ({"colonies": [1]}, 1)):
+        (ax,) = tf.pictures.time_course(path, **options).figure.axes
+        low, high = ax.get_xlim()
+        assert low < 0.0 and 2.0 < high < 2.2
+        marks = [x for c in ax.collections for x in c.get_offsets().tolist() if x != [0.0, 0.0]]
+        zeros = [x.tolist() for c in ax.collections if hasattr(c, "get_segments")
+                 for x in c.get_segments()]  # fmt: skip
+        np.testing.assert_allclose(marks, [[first, 0.0]] * died)
+        np.testing.assert_allclose(zeros, [[[first, 0.0], [2.0, 0.0]]] * died)
+        assert ax.get_yscale() == (scale if "by" in options else "linear")
+        bottom, top = ax.get_ylim()
+        assert bottom < 0.0 < top and 0.0 in ax.get_yticks()
+
+
 @pytest.mark.parametrize(
     ("names", "options", "words"),
     [

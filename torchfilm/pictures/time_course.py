@@ -50,8 +50,9 @@ def time_course(
     "out.NAME". by: a field of whole numbers, such as "cell_type": cells of each are counted apart,
     a colour for each, and a style of lines for each of up to four colonies. colonies: their ids;
     default the first `most` that had cells. log: logarithmic axes of the quantities; the number of
-    cells has one where it grows more than tenfold. out: save the picture there. Raises InputError
-    for a quantity that is not recorded, and for a file of one frame."""
+    cells has one where it grows more than tenfold. Where all cells of a line have died, a triangle
+    at 0 marks when; a logarithmic axis then has a 0 below 1. out: save the picture there. Raises
+    InputError for a quantity that is not recorded, and for a file of one frame."""
     with opened(what) as results:
         check_not_results(results.path, out)
         checked_dpi(dpi)
@@ -74,18 +75,20 @@ def time_course(
         for k, line in enumerate(lines):
             band, several = len(lines) <= FEW, each_label[line.label] > 1
             _draw(axes, results.times, seen[:, k], line, band and not several, several)
+            _draw_none(axes[0], results.times, seen[:, k, 0, 0], line, several)
         for label in (n for n, count in each_label.items() if count > 1):
             same = [k for k, x in enumerate(lines) if x.label == label]
             first = replace(lines[same[0]], label=f"{label}, mean of {len(same)}")
             _draw(axes, results.times, _mean(seen[:, same]), first)
-        counts = np.nan_to_num(seen[:, :, 0, 0])
-        some = counts[counts > 0].min(initial=np.inf)
-        _finish(axes[0], "cells", log=bool(counts.max(initial=0.0) > TENFOLD * max(1, some)))
+        _finish(axes[0], "cells", _scale_of_counts(seen[:, :, 0, 0]))
         for row, name in enumerate(quantities):
             unit = unit_at_cells(results, name)
             some = bool((seen[:, :, 1 + row] > 0).any())  # or there is no logarithm
-            _finish(axes[1 + row], f"mean of {name}" + f" ({unit})" * bool(unit), log and some)
+            scale = "log" if log and some else "linear"
+            _finish(axes[1 + row], f"mean of {name}" + f" ({unit})" * bool(unit), scale)
         axes[-1].set_xlabel("time (h)")
+        ends = results.times[[0, -1]]  # of the run, also where its last cell died before
+        axes[-1].set_xlim(*(ends + 0.05 * np.diff(ends) * [-1, 1]))
         if len(results.colony_id) > 1 or by is not None:
             axes[0].legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
         figure.suptitle(f"{frames.title}{more}", fontsize=9, parse_math=False)
@@ -116,6 +119,34 @@ def _draw(
         ax.plot(times, value, color=line.colour, ls=line.style, label=label, **width)
         if band and row:
             ax.fill_between(times, low, high, color=line.colour, alpha=0.2, lw=0)
+
+
+def _draw_none(
+    ax: Axes, times: np.ndarray, counts: np.ndarray, line: CourseLine, thin: bool
+) -> None:
+    """Mark where the cells of a line die out, and draw that there are 0 from then on. counts: of
+    each frame; NaN without cells."""
+    gone = _gone(counts)
+    change = np.diff(gone.astype(int), prepend=0, append=0)
+    begin, end = np.flatnonzero(change == 1), np.flatnonzero(change == -1) - 1
+    zero, lw = np.zeros(len(begin)), 0.5 if thin else 1.2
+    ax.hlines(zero, times[begin], times[end], color=line.colour, ls=line.style, lw=lw)
+    ax.scatter(times[begin], zero, s=12 if thin else 30, color=line.colour, marker="v", zorder=3)
+
+
+def _gone(counts: np.ndarray) -> np.ndarray:
+    """(frames, …) where no cells are left of those that were there before."""
+    none = np.isnan(counts)
+    return none & np.logical_or.accumulate(~none)
+
+
+def _scale_of_counts(counts: np.ndarray) -> str:
+    """Of the axis of numbers of cells, (frames, lines): logarithmic where they grow more than
+    tenfold, and linear from 0 to 1 below that, where cells die out."""
+    alive = counts[counts > 0]
+    if alive.max(initial=0.0) <= TENFOLD * max(1, alive.min(initial=np.inf)):
+        return "linear"
+    return "symlog" if _gone(counts).any() else "log"
 
 
 def _mean(seen: np.ndarray) -> np.ndarray:
@@ -181,10 +212,11 @@ def _colours(count: int) -> list[Any]:
     return [colormaps["viridis"](k / (count - 1)) for k in range(count)]
 
 
-def _finish(ax: Axes, label: str, log: bool = False) -> None:
+def _finish(ax: Axes, label: str, scale: str) -> None:
+    """scale: "linear", "log", or "symlog", which has 0, too."""
     ax.set_ylabel(label, parse_math=False)
-    if log:
-        ax.set_yscale("log")
+    more = {"linthresh": 1.0, "linscale": 0.5, "subs": range(2, 10)} if scale == "symlog" else {}
+    ax.set_yscale(scale, **more)
     ax.grid(False)
     for side in ("top", "right"):
         ax.spines[side].set_visible(False)
