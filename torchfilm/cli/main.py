@@ -38,6 +38,8 @@ COMMANDS: dict[str, type[Any]] = {
     "help": Help,
 }
 
+UNREADABLE = 2  # the exit code for a line that cannot be read, as the parser's own
+
 
 def main() -> None:
     """Entry point of the `torchfilm` command."""
@@ -62,7 +64,8 @@ def _command() -> None:
     try:
         check_options(sys.argv[1:])
     except InputError as error:
-        raise SystemExit(f"torchfilm: {error}") from None
+        print(f"torchfilm: {error}", file=sys.stderr)
+        raise SystemExit(UNREADABLE) from None
     command = tyro.extras.subcommand_cli_from_dict(
         {**COMMANDS},
         prog="torchfilm",
