@@ -66,3 +66,10 @@ def test_prose_is_at_most_100_columns_wide(page):
         if len(line) > 100 and not code and not written and not line.startswith(("|", "![")):
             long.append(number)
     assert long == []
+
+
+def test_the_readme_and_the_citation_file_ask_for_the_same():
+    citation = (ROOT / "CITATION.cff").read_text()
+    wish = re.search(r"^message: >-\n  (.*\.)$", citation, re.MULTILINE)
+    assert wish and wish[1] in " ".join((ROOT / "README.md").read_text().split())
+    assert f"\nversion: {torchfilm.__version__}\n" in citation
