@@ -60,6 +60,8 @@ def real_column(what: str, value: Any, state: State) -> Tensor:
     """A column of real numbers (N,): conditions and integers count as numbers, integers in float64,
     and one number is that of all cells."""
     column = as_tensor(what, value, state.device)
+    if not hasattr(value, "dtype") and column.is_floating_point():
+        column = column.to(state.dtype)
     if not column.is_floating_point():
         column = column.to(state.dtype if column.dtype == torch.bool else torch.float64)
     if column.shape not in ((), (state.cells,)):

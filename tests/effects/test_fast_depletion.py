@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from types import SimpleNamespace
 
@@ -198,3 +199,18 @@ def test_a_signal_that_rises_and_falls_with_its_source_follows_it():
         exact = rest + (exact - rest) * share
         worst = max(worst, abs(float(state.signals["drug"].mean()) / exact - 1.0))
     assert worst < 0.03
+
+
+@pytest.mark.parametrize("decay", [40.0, 400.0, 4000.0])
+def test_a_signal_that_is_late_by_half_a_step_is_so_in_every_step(decay):
+    """One that turns over faster than a step follows its cells, which here make 5 % more in each;
+    parts of a step in some of them would make it go up by turns of 4 and 6 %."""
+
+    def rising(u, s, p, cell):
+        made = 1e7 * p.k * torch.exp(2.0 * u.eaten)
+        return {"eaten": 1.0 + 0.0 * u.eaten}, {"drug": made * cell.volume}
+
+    seen = [float(x.signals["drug"].mean()) for x in tf.simulate(
+        fading({"decay": decay}, rising), until=1.0, dtype=F64)]  # fmt: skip
+    steps = [later / before for before, later in itertools.pairwise(seen[20:])]
+    assert max(steps) - min(steps) < 2e-3 and steps[-1] == pytest.approx(math.exp(0.05), abs=2e-3)

@@ -422,3 +422,17 @@ def test_numbers_that_a_rule_sets_have_the_precision_of_the_state():
     assert set(state.growth_rate.tolist()) == {1.1} and state.cells == 2
     assert state.since.tolist() == pytest.approx([0.2, 0.2], abs=1e-12)
     assert set(state.level.tolist()) <= {0.1, 0.7}
+
+
+def test_numbers_among_columns_have_the_type_of_the_state():
+    """A sum of 1 over the cells of a colony is in float32 where they are."""
+
+    def update(cells):
+        cells.level = cells.colony_sum(1.0)
+        seen.append(cells.colony_sum(1.0).dtype)
+
+    seen: list[torch.dtype] = []
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Rules(update, variables={"level": 0.0}), dim=2, dt=0.1)
+    for dtype in (torch.float32, torch.float64):
+        tf.simulate(scene, until=0.1, dtype=dtype).last()
+    assert seen[0] == torch.float32 and seen[-1] == torch.float64

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import pytest
@@ -69,7 +70,8 @@ def test_a_run_goes_on_with_a_unit_that_was_not_named(tmp_path):
 @pytest.mark.parametrize(
     ("typed", "unit"),
     [("nM", "nM"), ("uM", "µM"), ("\N{GREEK SMALL LETTER MU}M", "µM"), (" mM ", "mM"),
-     ("ug/mL", "µg/mL"), ("molecules/um3", "molecules/µm³"), ("conc", "conc")],
+     ("ug/mL", "µg/mL"), ("ug/ml", "µg/mL"), ("molecules/um3", "molecules/µm³"),
+     ("molecules/µm^3", "molecules/µm³"), ("conc", "conc")],
 )  # fmt: skip
 def test_names_of_units(typed, unit):
     assert tf.Signal(1.0, concentration_unit=typed).concentration_unit == unit
@@ -156,3 +158,43 @@ def test_a_constant_may_be_called_unit():
     with pytest.raises(tf.InputError, match="Did you mean concentration_unit"):
         tf.Circuit(make, species=("ahl",), unit="nM")
     assert tf.Circuit(make, species=("ahl",), unit=2.0).parameters["unit"] == 2.0
+
+
+def test_what_is_no_concentration_is_shared_whatever_the_unit():
+    """Variables of rules, which have no unit, and fields of effects."""
+    use = lambda u, s, p, cell: {"gfp": u.level - u.gfp, "level": -u.level}
+    for shared in ("level", "growth_rate"):
+        rates = use if shared == "level" else lambda u, s, p, cell: {"gfp": u.growth_rate - u.gfp}
+        second = tf.Circuit(rates, species="gfp", shared=(shared,), name="second")
+        rules = tf.Rules(lambda cells: None, variables={"level": 1.0})
+        made = tf.Scene(tf.Growth(rate=0.5), rules, second, dim=2, dt=0.1)
+        assert float(tf.simulate(made, until=0.2).last().second_gfp[0]) > 0.05
+
+
+def test_molecules_follow_the_unit_of_a_circuit_that_is_changed():
+    birth = [tf.Reaction({}, {"ahl": 1}, rate=1.0)]
+    smooth = tf.Circuit(birth, species=("ahl",), concentration_unit="nM")
+    assert tf.digest(smooth) == tf.digest(tf.Circuit(birth, species=("ahl",)))
+    counted = dataclasses.replace(smooth, method="tau_leap", rtol=1e-3)
+    assert counted.molecules_per_unit == pytest.approx(0.602214076)
+    mille = dataclasses.replace(counted, concentration_unit="mM")
+    assert mille.molecules_per_unit == pytest.approx(602214.076)
+    own = tf.Circuit(birth, species=("ahl",), concentration_unit="nM", molecules_per_unit=1.0)
+    assert own.molecules_per_unit == 1.0  # which nothing reads
+    by_mass = tf.Circuit(birth, species=("ahl",), concentration_unit="g/L")
+    for circuit in (own, by_mass):
+        with pytest.raises(tf.InputError, match="molecules_per_unit"):
+            dataclasses.replace(circuit, method="tau_leap")
+
+
+def test_a_state_with_a_reservoir_goes_on_with_a_named_unit():
+    def fed(unit):
+        around = tf.Signal(diffusion=1e3, **({} if unit is None else {"concentration_unit": unit}))
+        medium = tf.Medium(ahl=around, **BOX, outside="reservoir")
+        return tf.Scene(tf.Growth(rate=1.0), medium, dim=2, dt=0.1)
+
+    state = tf.simulate(fed(None), until=0.2).last()
+    assert fed("nM").bind(state=state).step(state, 0.1).step == 3
+    named = tf.simulate(fed("nM"), until=0.2).last()
+    with pytest.raises(tf.InputError, match="ahl"):
+        fed("mM").bind(state=named)

@@ -220,16 +220,15 @@ def check_replicated(
 def molecules_in(unit: str, given: Any, method: str) -> Any:
     """The option `molecules_per_unit`, by default that of the unit of concentrations where
     molecules are counted, and 1 elsewhere, where nothing reads it."""
-    name, known = "Circuit.molecules_per_unit", units.MOLECULES.get(unit)
-    if given is None:
-        if method not in (LEAP, DIRECT):
-            known = None
-        elif known is None and unit in units.NAMED:
+    counts = method in (LEAP, DIRECT)
+    name, known = "Circuit.molecules_per_unit", units.MOLECULES.get(unit) if counts else None
+    if given is None or isinstance(given, units.ByDefault):
+        if known is None and unit in units.NAMED and counts:
             raise checks.InputError(
                 f"{name} is missing: how many molecules there are in 1 {unit} × µm³ depends on"
                 " their mass, or on the scale."
             )
-        return checked(name, known or 1.0, Rule(above=0.0, scope=COLONY))
+        return units.ByDefault(known or 1.0)
     made = checked(name, given, Rule(above=0.0, scope=COLONY))
     apart = 0.0 if known is None else float((numbers(made).detach() / known - 1.0).abs().max())
     if apart > units.CLOSE:
@@ -243,8 +242,8 @@ def _check_units(circuit: Any, exchanged: Mapping[Any, Iterable[str]], state: St
     have different units."""
     names = dict.fromkeys(OUTSIDE + n for each in exchanged.values() for n in each)
     for name in (*names, *circuit.shared.values()):
-        there = state.declared[name].unit
-        if units.differ(circuit.concentration_unit, there):
+        there = state.declared[name].unit  # of a variable, no concentration, it may be none
+        if units.is_concentration(there) and units.differ(circuit.concentration_unit, there):
             what = "exchanges the signal" if name in names else "shares the species"
             raise checks.InputError(
                 f"{circuit.value_owner()} is in {circuit.concentration_unit}, and {what}"

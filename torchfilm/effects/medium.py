@@ -39,6 +39,7 @@ from torchfilm.state import COLONY, GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import check_backend, why_torch
 from torchfilm.tools.parts import keywords
+from torchfilm.tools.units import AMOUNT
 
 OUTSIDE_CELLS = ("error", "grow", "reservoir")
 EXCHANGES = ("turns", "together")
@@ -223,7 +224,7 @@ class Medium(Effect):
             # float64: after thousands of steps, a float32 sum would round away what a step adds
             meaning = "amount given to the reservoir outside the box, less what was taken"
             fields += [
-                Field(f"{n}_reservoir", meaning, f"{x}·µm³", scope=COLONY, dtype=torch.float64)
+                Field(f"{n}_reservoir", meaning, x + AMOUNT, scope=COLONY, dtype=torch.float64)
                 for n, x in unit.items()
             ]
         return tuple(fields)

@@ -37,6 +37,7 @@ COARSE = 0.02
 # What may leave a colony's grid in such a step, to cells, by decay and through faces, where the
 # content changes by as much: a colony's own growth is less, and its signal late by half of that.
 LATE = 0.04
+SLIGHT = 1e-4  # a share whose exponential is 1 less the share
 
 
 class JointMove(NamedTuple):
@@ -188,7 +189,8 @@ class JointTransport:
         """The colonies, (B,) bool, for which the step is too long: they took backward Euler, whose
         error is half the share that left times the share by which the content changed, a step.
         Of what cells took both are more than COARSE, in the geometric mean; or of all that left,
-        by decay and through faces too, each is more than LATE. released: (N,), conc·µm³."""
+        by decay and through faces too, each is more than LATE, but for what is within reach of its
+        steady state in any case. released: (N,), conc·µm³."""
         far = torch.zeros(self.groups.size, dtype=torch.bool, device=self.field.device)
         for batch, own in zip(self.grid.batches, self._far, strict=True):
             far[batch.colonies] = torch.as_tensor(own, device=far.device)
@@ -203,7 +205,8 @@ class JointTransport:
         given = torch.where(self.fed, both(released.detach())[0].double().clamp(min=0.0), 0.0)
         left = self.groups.sum(given) + self._entered() - (after - before)
         eaten = taken * change > COARSE**2 * after * before
-        late = torch.minimum(left, change).clamp(min=0.0) ** 2 > LATE**2 * after * before
+        both_shares = torch.minimum(left, change).clamp(min=0.0) * _astray(left, after)
+        late = both_shares > LATE * (after * before).sqrt()
         return far & (eaten | late) & (before > nothing)
 
     def _entered(self) -> Tensor:
@@ -222,3 +225,13 @@ class JointTransport:
     def _read(self, field: Tensor) -> Tensor:
         """What each cell finds of a field (voxels,), (N,)."""
         return (self.stencil.weight.double() * self.stencil.gather(field)).sum(1)
+
+
+def _astray(left: Tensor, after: Tensor) -> Tensor:
+    """By how much a step of backward Euler is off the exponential, as a share of what it is where
+    little leaves, (B,): with x = left/after it goes (1 − (1 + x) exp(−x))/x of its way too far or
+    not far enough, against x/2. What is lost within a step is close to its steady state then."""
+    x = left.clamp(min=0.0) / after.clamp(min=TINY)
+    off = -torch.expm1(-x) - x * torch.exp(-x)
+    small = x < SLIGHT
+    return torch.where(small, 1.0, 2.0 * off / torch.where(small, 1.0, x * x.clamp(max=1.0)))

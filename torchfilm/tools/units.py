@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from torchfilm.tools import checks
 
 CONCENTRATION = "conc"  # of species and signals whose unit is not named
@@ -12,7 +14,12 @@ MOLAR = {"M": 1.0, "mM": 1e-3, "µM": 1e-6, "nM": 1e-9, "pM": 1e-12}
 MOLECULES = {"molecules/µm³": 1.0} | {n: x * AVOGADRO / LITRE for n, x in MOLAR.items()}
 MASSES = ("g/L", "mg/L", "µg/L", "ng/L", "mg/mL", "µg/mL", "ng/mL")
 NAMED = (*MOLECULES, *MASSES, "a.u.")
+AMOUNT = "·µm³"  # what a unit of concentration is times a volume
 CLOSE = 0.01  # how far molecules_per_unit may be from that of a unit, relative
+
+
+class ByDefault(float):
+    """A number that follows from a unit, and does so again for another unit."""
 
 
 def is_concentration(unit: str) -> bool:
@@ -25,9 +32,8 @@ def checked_unit(name: str, given: object) -> str:
     for the micro sign."""
     text = given.strip() if isinstance(given, str) else None
     if text is not None:
-        text = text.replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
-        text = "\N{MICRO SIGN}" + text[1:] if text[:1] == "u" else text
-        text = text.replace("um^3", "µm³").replace("um3", "µm³").replace("µm3", "µm³")
+        text = re.sub("^u|(?<=/)u|\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}", text)
+        text = re.sub(r"m\^?3$", "m³", text).removesuffix("l") + "L" * text.endswith("l")
     if text is None or not is_concentration(text):
         rule = f"a unit of concentration: one of {', '.join(NAMED)}"
         raise checks.input_error(name, given, rule, "Leave it out for a unit of your own.")
@@ -35,7 +41,10 @@ def checked_unit(name: str, given: object) -> str:
 
 
 def differ(one: str, other: str) -> bool:
-    """Whether two units are different ones; a concentration without a named unit fits any."""
+    """Whether two units are different ones; a concentration without a named unit fits any, and so
+    does an amount by it."""
+    if one.endswith(AMOUNT) and other.endswith(AMOUNT):
+        one, other = one.removesuffix(AMOUNT), other.removesuffix(AMOUNT)
     if CONCENTRATION in (one, other) and is_concentration(one) and is_concentration(other):
         return False
     return one != other
