@@ -175,10 +175,24 @@ def test_molecules_follow_the_unit_of_a_circuit_that_is_changed():
     birth = [tf.Reaction({}, {"ahl": 1}, rate=1.0)]
     smooth = tf.Circuit(birth, species=("ahl",), concentration_unit="nM")
     assert tf.digest(smooth) == tf.digest(tf.Circuit(birth, species=("ahl",)))
-    counted = dataclasses.replace(smooth, method="tau_leap", rtol=1e-3)
+    assert tf.digest(smooth) == tf.digest(
+        tf.Circuit(birth, species=("ahl",), molecules_per_unit=1.0)
+    )
+    by_unit = {"method": "tau_leap", "molecules_per_unit": None}
+    counted = dataclasses.replace(smooth, **by_unit)
     assert counted.molecules_per_unit == pytest.approx(0.602214076)
-    mille = dataclasses.replace(counted, concentration_unit="mM")
+    other = tf.Circuit(birth, species=("ahl",), method="tau_leap",
+                       molecules_per_unit=counted.molecules_per_unit)  # fmt: skip
+    assert other.molecules_per_unit == counted.molecules_per_unit
+    mille = dataclasses.replace(counted, concentration_unit="mM", molecules_per_unit=None)
     assert mille.molecules_per_unit == pytest.approx(602214.076)
+    assert dataclasses.replace(smooth, rtol=1e-3).molecules_per_unit == 1.0
+    for circuit, change in (
+        (smooth, {"method": "tau_leap"}),
+        (counted, {"concentration_unit": "mM"}),
+    ):
+        with pytest.raises(tf.InputError, match=r"by dataclasses\.replace give None"):
+            dataclasses.replace(circuit, **change)
     own = tf.Circuit(birth, species=("ahl",), concentration_unit="nM", molecules_per_unit=1.0)
     assert own.molecules_per_unit == 1.0  # which nothing reads
     by_mass = tf.Circuit(birth, species=("ahl",), concentration_unit="g/L")

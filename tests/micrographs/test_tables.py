@@ -349,7 +349,12 @@ BAD = {
     "an angle in capitals": (
         {"x_um": [0.0], "y_um": [0.0], "length_um": [1.0], "ANGLE_RAD": [0.0]},
         {},
-        r"direction: .*rename ANGLE_RAD to angle_rad, or give columns=\{'angle': 'ANGLE_RAD'\}",
+        r"direction: .*rename ANGLE_RAD to angle_rad\.$",
+    ),
+    "a name in capitals beside the same with a unit": (
+        {"X": [0.0], "Y": [0.0], "Angle": [0.0], "length_um": [1.0], "angle_rad": [0.0]},
+        {},
+        r"lacks the column 'x'.*rename X, Y to x, y, or give columns=\{'x': 'X', 'y': 'Y'\}\.$",
     ),
     "a field in capitals": (
         {**ONE, "GFP": [1.0]},

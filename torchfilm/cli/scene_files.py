@@ -182,13 +182,13 @@ def _call_own(make: Callable[..., Any], name: str, parameters: dict[str, Any], p
     except TypeError as error:
         several = {n: x for n, x in parameters.items() if isinstance(x, (list, tuple, PerColony))}
         values = {n: x.values if isinstance(x, PerColony) else x for n, x in several.items()}
-        alone = {n: x[0] for n, x in values.items() if len(x)}
-        if not alone or not _works(make, {**parameters, **alone}):
+        alone = {n: x[0] for n, x in values.items() if isinstance(x, (list, tuple)) and x}
+        # the one that is at fault, or the first of several
+        first = next((n for n in alone if _works(make, {**parameters, n: alone[n]})), None)
+        if first is None and len(alone) > 1 and _works(make, {**parameters, **alone}):
+            first = next(iter(alone))
+        if first is None:
             raise
-        first = next(
-            (n for n in alone if not _works(make, {**parameters, **alone, n: several[n]})),
-            next(iter(alone)),
-        )
         own = f"list({first})" if isinstance(several[first], tuple) else first
         raise checks.input_error(
             f"{name}: {first}",

@@ -217,23 +217,33 @@ def check_replicated(
     return names
 
 
+def _is_one(given: Any) -> bool:
+    """Whether it is the number that circuits have which count no molecules."""
+    return isinstance(given, Real) and given == 1
+
+
 def molecules_in(unit: str, given: Any, method: str) -> Any:
     """The option `molecules_per_unit`, by default that of the unit of concentrations where
     molecules are counted, and 1 elsewhere, where nothing reads it."""
     counts = method in (LEAP, DIRECT)
     name, known = "Circuit.molecules_per_unit", units.MOLECULES.get(unit) if counts else None
-    if given is None or isinstance(given, units.ByDefault):
-        if known is None and unit in units.NAMED and counts:
-            raise checks.InputError(
-                f"{name} is missing: how many molecules there are in 1 {unit} × µm³ depends on"
-                " their mass, or on the scale."
-            )
-        return units.ByDefault(known or 1.0)
+    if counts and unit in units.MASSES and (given is None or _is_one(given)):
+        raise checks.InputError(
+            f"{name} is missing: how many molecules there are in 1 {unit} × µm³ depends on their"
+            " mass."
+        )
+    if given is None:
+        return known or 1.0
     made = checked(name, given, Rule(above=0.0, scope=COLONY))
     apart = 0.0 if known is None else float((numbers(made).detach() / known - 1.0).abs().max())
     if apart > units.CLOSE:
         rule = f"about {known:.4g} where concentration_unit = {unit!r}, which it is by default"
-        raise checks.input_error(name, given, rule, "Leave one of the two out.")
+        raise checks.input_error(
+            name,
+            given,
+            rule,
+            "Leave one of the two out; in a copy by dataclasses.replace give None.",
+        )
     return made
 
 

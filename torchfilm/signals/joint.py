@@ -38,6 +38,7 @@ COARSE = 0.02
 # content changes by as much: a colony's own growth is less, and its signal late by half of that.
 LATE = 0.04
 SLIGHT = 1e-4  # a share whose exponential is 1 less the share
+MANY = 500.0  # falls by e, after which nothing is left
 
 
 class JointMove(NamedTuple):
@@ -231,7 +232,7 @@ def _astray(left: Tensor, after: Tensor) -> Tensor:
     """By how much a step of backward Euler is off the exponential, as a share of what it is where
     little leaves, (B,): with x = left/after it goes (1 − (1 + x) exp(−x))/x of its way too far or
     not far enough, against x/2. What is lost within a step is close to its steady state then."""
-    x = left.clamp(min=0.0) / after.clamp(min=TINY)
+    x = (left.clamp(min=0.0) / after.clamp(min=TINY)).clamp(max=MANY)
     off = -torch.expm1(-x) - x * torch.exp(-x)
     small = x < SLIGHT
     return torch.where(small, 1.0, 2.0 * off / torch.where(small, 1.0, x * x.clamp(max=1.0)))

@@ -272,13 +272,21 @@ class Table:
             for name, kind in kinds.items()
             for end in ("", *(f"_{unit}" for unit in UNITS[kind]))
         }
-        cased = [n for n in self.columns if n.lower() in spelt and n not in spelt]
+        there = {spelt[n] for n in self.columns if n in spelt}
+        cased: dict[str, str] = {}
+        for column in self.columns:
+            name = spelt.get(column.lower())
+            if name is not None and name not in there:
+                cased.setdefault(name, column)
         if not cased:
             return ""
-        columns = {spelt[n.lower()]: n for n in cased}
+        # a unit in capitals would not be known of a column that is given by its name
+        units_fit = all(n.endswith(n.lower()[len(name) :]) for name, n in cased.items())
         return (
-            f"Upper and lower case count: rename {', '.join(cased)} to"
-            f" {', '.join(n.lower() for n in cased)}, or give columns={columns!r}."
+            f"Upper and lower case count: rename {', '.join(cased.values())} to"
+            f" {', '.join(n.lower() for n in cased.values())}"
+            + f", or give columns={cased!r}." * units_fit
+            + "." * (not units_fit)
         )
 
 

@@ -18,10 +18,6 @@ AMOUNT = "·µm³"  # what a unit of concentration is times a volume
 CLOSE = 0.01  # how far molecules_per_unit may be from that of a unit, relative
 
 
-class ByDefault(float):
-    """A number that follows from a unit, and does so again for another unit."""
-
-
 def is_concentration(unit: str) -> bool:
     """Whether a unit is one of concentrations."""
     return unit == CONCENTRATION or unit in NAMED
