@@ -166,7 +166,7 @@ def _shown(target: Target, grown: list[FinishedColonies]) -> list[str]:
     if target.names or target.strains:
         there = known(state)
         return [n for n in target.names if n in there]
-    species = [n for n, f in state.declared.items() if f.is_concentration and f.scope == "cell"]
+    species = [n for n, f in state.declared.items() if f.is_species]
     return species[:1]
 
 

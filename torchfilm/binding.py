@@ -149,9 +149,9 @@ def _means_the_same(wanted: Field, state: State) -> bool:
     added length."""
     about = lambda field: (field.meaning, field.scope, field.shape)
     there = state.declared.get(wanted.name)
-    alike = there is not None and about(wanted) == about(there)
-    alike = alike and there is not None and not units.differ(wanted.unit, there.unit)
-    return alike and state.fields[wanted.name].dtype == (wanted.dtype or state.dtype)
+    if there is None or about(wanted) != about(there) or units.differ(wanted.unit, there.unit):
+        return False
+    return state.fields[wanted.name].dtype == (wanted.dtype or state.dtype)
 
 
 def _count(

@@ -59,9 +59,7 @@ def check_integers(name: str, tensor: Tensor, dtype: torch.dtype) -> None:
 def real_column(what: str, value: Any, state: State) -> Tensor:
     """A column of real numbers (N,): conditions and integers count as numbers, integers in float64,
     and one number is that of all cells."""
-    column = as_tensor(what, value, state.device)
-    if not hasattr(value, "dtype") and column.is_floating_point():
-        column = column.to(state.dtype)
+    column = as_tensor(what, value, state.device, state.dtype)
     if not column.is_floating_point():
         column = column.to(state.dtype if column.dtype == torch.bool else torch.float64)
     if column.shape not in ((), (state.cells,)):
@@ -72,16 +70,18 @@ def real_column(what: str, value: Any, state: State) -> Tensor:
     return column.expand(state.cells)
 
 
-def as_tensor(name: str, value: Any, device: torch.device) -> Tensor:
-    """The value as a tensor, or RuleError."""
+def as_tensor(
+    name: str, value: Any, device: torch.device, numbers: torch.dtype = torch.float64
+) -> Tensor:
+    """The value as a tensor, or RuleError. numbers: the type of Python's real numbers, of which
+    torch's default would keep half of the digits."""
     try:
         value = by_position(value)
         if isinstance(value, Tensor):
             return value
         made = torch.as_tensor(value, device=device)
         if made.is_floating_point() and not hasattr(value, "dtype"):
-            # Python's numbers have double precision, of which torch's default would keep half
-            made = torch.as_tensor(value, dtype=torch.float64, device=device)
+            made = torch.as_tensor(value, dtype=numbers, device=device)
         return made
     except (TypeError, ValueError, RuntimeError) as error:
         raise RuleError(

@@ -60,8 +60,9 @@ class Field(metaclass=checks.KnownKeywords):
             raise checks.input_error("Field.name", self.name, rule)
 
     @property
-    def is_concentration(self) -> bool:
-        return is_concentration(self.unit)
+    def is_species(self) -> bool:
+        """Whether it is a concentration in each cell."""
+        return self.scope == CELL and is_concentration(self.unit)
 
     def start(self, state: State, rows: Tensor) -> Tensor:
         """Initial values for the given rows (M,) of the state: (M, *shape)."""

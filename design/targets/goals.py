@@ -48,9 +48,7 @@ class Burden(Target):
     def _of(self, state: tf.State) -> tuple[str, ...]:
         if self.species is not None:
             return self.species
-        return tuple(
-            n for n, f in state.declared.items() if f.is_concentration and f.scope == "cell"
-        )
+        return tuple(n for n, f in state.declared.items() if f.is_species)
 
     def check(self, state: tf.State) -> None:
         require(state, self._of(state))

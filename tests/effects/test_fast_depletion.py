@@ -167,7 +167,7 @@ FADES = {"decay": 10.0}, {"boundary": tf.BoundaryConditions(z=(tf.Robin(0.0, 10.
 
 @pytest.mark.parametrize("loss", FADES, ids=["decay", "a face"])
 def test_what_leaves_without_cells_falls_as_the_exponential(loss):
-    """At most 2 % too much after each fall by e; whole steps, as of cells that only give or take a
+    """About 2 % too much after each fall by e; whole steps, as of cells that only give or take a
     little, had 71 % after five."""
     scene = fading(loss)
     assert math.exp(-5.0) < left(scene, until=0.5) < 1.1 * math.exp(-5.0)

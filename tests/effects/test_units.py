@@ -34,7 +34,7 @@ def test_units_are_those_of_fields_pictures_and_files(tmp_path):
     model = named.bind(seed=1)
     state, other = model.step(model.start(), 0.1), plain.bind(seed=1)
     assert {state.declared[n].unit for n in ("ahl", "out.ahl")} == {"nM"}
-    assert state.declared["ahl"].is_concentration
+    assert state.declared["ahl"].is_species and not state.declared["out.ahl"].is_species
     assert "nM" in model.describe()
     frame = tf.pictures.frame_of(state)
     assert (frame.units["ahl"], frame.units["out.ahl"]) == ("nM", "nM")

@@ -238,12 +238,8 @@ def molecules_in(unit: str, given: Any, method: str) -> Any:
     apart = 0.0 if known is None else float((numbers(made).detach() / known - 1.0).abs().max())
     if apart > units.CLOSE:
         rule = f"about {known:.4g} where concentration_unit = {unit!r}, which it is by default"
-        raise checks.input_error(
-            name,
-            given,
-            rule,
-            "Leave one of the two out; in a copy by dataclasses.replace give None.",
-        )
+        hint = "Leave one of the two out; in a copy by dataclasses.replace give None."
+        raise checks.input_error(name, given, rule, hint)
     return made
 
 

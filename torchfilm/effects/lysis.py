@@ -14,7 +14,7 @@ from torchfilm.effect import LYSIS, Binding, BoundEffect, Effect
 from torchfilm.medium_exchange import MediumExchange
 from torchfilm.resolver import Values
 from torchfilm.signals.schedule import warn_of_means
-from torchfilm.state import CELL, OUTSIDE, State
+from torchfilm.state import OUTSIDE, State
 from torchfilm.tools import checks, units
 from torchfilm.tools.random import fine_uniform
 from torchfilm.tools.read_only import read_only
@@ -208,7 +208,7 @@ class Lysis(Effect):
         for name in self._variables():
             check_variable("Lysis", name, state, at_least_zero=name in self.at_least_zero())
         own = None if self.hazard is None else state.declared[self.hazard]
-        if own is not None and own.unit and not own.is_concentration:  # no species, no variable
+        if own is not None and own.unit and not own.is_species:  # no species, no variable
             raise checks.input_error(
                 "Lysis.hazard", self.hazard,
                 "a species of a circuit, or a variable of rules, that is only for it",
@@ -223,10 +223,12 @@ class Lysis(Effect):
         for signal, names in released.items():
             there = state.declared[OUTSIDE + signal].unit
             for name in () if _has_shares((self.releases or {})[signal]) else names:
-                own = state.declared.get(name)
-                if own and own.is_concentration and units.differ(own.unit, there):
+                if not _is_species(state, name):
+                    continue
+                own = state.declared[name].unit
+                if units.differ(own, there):
                     raise checks.InputError(
-                        f"Lysis.releases gives {name!r}, in {own.unit}, to the signal {signal!r},"
+                        f"Lysis.releases gives {name!r}, in {own}, to the signal {signal!r},"
                         f" which is in {there}: give both one unit, or the factor between them,"
                         f" {{{name!r}: …}}."
                     )
@@ -365,6 +367,5 @@ def _quantity(state: State, name: str) -> Tensor:
 
 
 def _is_species(state: State, name: str) -> bool:
-    """Whether it is a concentration in each cell."""
-    declared = state.declared.get(name)
-    return declared is not None and declared.scope == CELL and declared.is_concentration
+    declared = state.declared.get(name)  # a cell's volume is not declared
+    return declared is not None and declared.is_species

@@ -19,6 +19,9 @@ from torchfilm.physics.problem import (
     TOO_STICKY,
 )
 
+if TYPE_CHECKING:
+    from torchfilm.state import State
+
 # What may help, by status; SOLVE for the others.
 SOLVE = (
     "A smaller dt, a larger alpha or more max_iterations may help; and where cells stick together,"
@@ -37,10 +40,6 @@ HINTS = {
         " give way too much; or start from cells that do not overlap"
     ),
 }
-
-
-if TYPE_CHECKING:
-    from torchfilm.state import State
 
 
 @dataclass(frozen=True)

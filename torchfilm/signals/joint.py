@@ -206,17 +206,17 @@ class JointTransport:
         given = torch.where(self.fed, both(released.detach())[0].double().clamp(min=0.0), 0.0)
         left = self.groups.sum(given) + self._entered() - (after - before)
         eaten = taken * change > COARSE**2 * after * before
-        both_shares = torch.minimum(left, change).clamp(min=0.0) * _astray(left, after)
-        late = both_shares > LATE * (after * before).sqrt()
+        lesser = torch.minimum(left, change).clamp(min=0.0)
+        late = lesser * _astray(left, after) > LATE * (after * before).sqrt()
         return far & (eaten | late) & (before > nothing)
 
     def _entered(self) -> Tensor:
         """What came from sources and through faces, (B,), conc·µm³."""
         found = torch.zeros(self.groups.size, dtype=torch.float64, device=self.field.device)
         for one, batch in zip(self.carried, self.grid.batches, strict=True):
-            gain = both(x.detach())[0] if (x := one.operator.gain) is not None else None
-            if gain is not None:
-                found[batch.colonies] = gain.sum((1, 2, 3)).expand(len(batch.colonies))
+            if (gain := one.operator.gain) is not None:
+                total = both(gain.detach())[0].sum((1, 2, 3))
+                found[batch.colonies] = total.expand(len(batch.colonies))
         return found * (self.grid.voxel_volume * self.dt)
 
     def _spread(self, per_cell: Tensor) -> Tensor:

@@ -306,4 +306,4 @@ def _left_out(name: str, parts: Sequence[Tensor]) -> Tensor:
 
 def species(state: State) -> list[str]:
     """Names of the fields that are concentrations in cells."""
-    return [name for name, f in state.declared.items() if f.scope == "cell" and f.is_concentration]
+    return [name for name, f in state.declared.items() if f.is_species]
