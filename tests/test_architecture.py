@@ -91,7 +91,8 @@ ONE_EFFECT = [
         "circuit bound_circuit circuit_cells circuit_checks circuit_kernels circuit_report"
         " circuit_sbml circuit_words circuit_daughters",
         "division compiled_division division_lengths",
-        "medium bound_medium medium_transport medium_values scaled signal",
+        "medium bound_medium medium_coverage medium_substeps medium_transport medium_values scaled"
+        " signal",
         "rules bound_rules bound_division_rule",
         "mechanics bound_mechanics mechanics_report mechanics_words",
     )

@@ -13,8 +13,9 @@ import torch
 
 import torchfilm as tf
 from torchfilm.effects import KNOWN, medium_transport
-from torchfilm.effects.bound_medium import FirstHalf, GridCoverage
+from torchfilm.effects.bound_medium import FirstHalf
 from torchfilm.effects.mechanics import TOLERANCE
+from torchfilm.effects.medium_coverage import GridCoverage
 from torchfilm.explanation import left_out, replayed
 from torchfilm.kernels.scheme import OVERLAP, PASSES
 from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE

@@ -98,6 +98,9 @@ class Together:
             for done in range(number):
                 with first.timed(state, timings), first.threads(state):
                     state = self._part(state, dt / number, done, number)
+                if done < number - 1 and medium.sub_steps is not None:
+                    with medium.timed(state, timings), medium.threads(state):
+                        state = medium.between(state, dt)
         with medium.timed(state, timings), medium.threads(state):
             return medium.step(state, dt)
 

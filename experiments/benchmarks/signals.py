@@ -28,12 +28,11 @@ from scipy.special import ive
 import torchfilm as tf
 from torchfilm.signals.grid import Grid
 from torchfilm.signals.transport import COMPILED, METHODS, Carrier, carry, prepare
-from torchfilm.signals.transport_iterative import convolve
 from torchfilm.signals.transport_operator import Operator, apply
 from torchfilm.signals.transport_rates import build_operator
 
 SIZES = (32, 64, 128)
-CASES = (*METHODS, "implicit, mask", "apply", "conv3d")
+CASES = (*METHODS, "implicit, mask", "apply")
 R, STEPS = 0.25, 4
 # of `kernels`: shape of the grids, and colonies; the last are those of a search for a stripe
 GRIDS = (((64, 64, 64), 1), ((64, 64, 1), 64), ((64, 4, 12), 256))
@@ -84,9 +83,8 @@ def run(n: int, case: str, dtype: torch.dtype, device: str, seconds: float) -> d
         "device": device,
         "r": R,
     }
-    if case in ("apply", "conv3d"):
-        rate = apply if case == "apply" else convolve
-        least, median, count = timed(lambda: rate(transport_operator, spread), device, seconds)
+    if case == "apply":
+        least, median, count = timed(lambda: apply(transport_operator, spread), device, seconds)
         return record | {
             "least_ms": round(least, 4),
             "median_ms": round(median, 4),

@@ -13,13 +13,8 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import DIVISION, TRANSPORT, Binding, BoundEffect, Effect
-from torchfilm.effects.bound_medium import (
-    BLOCK,
-    BoundMedium,
-    DaughtersCoverage,
-    FirstHalf,
-    GridCoverage,
-)
+from torchfilm.effects.bound_medium import BoundMedium, FirstHalf
+from torchfilm.effects.medium_coverage import BLOCK, DaughtersCoverage, GridCoverage
 from torchfilm.effects.medium_transport import EXACT, Transport
 from torchfilm.effects.signal import Flow, Signal, check_boundary, reach_of, smear_of, velocity
 from torchfilm.parameters import number_range
@@ -73,7 +68,8 @@ class Medium(Effect):
     voxel in seconds. "turns": circuits with a pool for each cell, then transport; of first order,
     and two to three times as fast. Default: together, but in turns where circuits count molecules,
     a nutrient is exchanged as well, or a `method` or `splitting="lie"` is given.
-    steps: into which exchange and transport divide a step of the scene; growth and contacts do not.
+    steps: into which exchange, transport and MediumReactions divide a step of the scene; growth and
+    contacts do not.
 
     method: of transport in turns, and of signals that no cell exchanges: "exponential" (exact if
     there are no obstacles and flow and decay are uniform), "series" (exact), "implicit" (one solve

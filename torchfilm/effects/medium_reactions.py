@@ -31,6 +31,7 @@ from torchfilm.values import COLONY, Rule, checked_constants
 
 CONSTANT = Rule(scope=COLONY, scheduled=True)
 TRIED = 16  # voxels, of a trial
+SMALL = 0.1  # see `numerics`: changes by reactions in a sub-step that keep what transport balances
 
 # Rates of signals, conc/h by name, from their concentrations s and constants p.
 Rates = Callable[[Names, Names], Mapping[str, Tensor]]
@@ -60,10 +61,11 @@ class MediumReactions(Effect):
     parameters: constants by name, one number, one per colony, or a Schedule. rtol, atol: the error
     of a step is at most atol + rtol·|s| in each voxel. backend: as in Circuit.
 
-    A stiff solver takes half of each step before transport and exchange and half after (Strang);
-    reactions make nothing negative. Obstacles hold no signal, and nothing reacts there. The rates
-    of reactions in a list are numbers, one per colony, or names of parameters. Where a voxel cannot
-    be stepped its colony fails; in a colony without cells it keeps its concentrations.
+    A stiff solver takes half of each step before transport and exchange and half after (Strang), or
+    takes turns with them as often as `Medium.steps` says; reactions make nothing negative.
+    Obstacles hold no signal, and nothing reacts there. The rates of reactions in a list are
+    numbers, one per colony, or names of parameters. Where a voxel cannot be stepped its colony
+    fails; in a colony without cells it keeps its concentrations.
     """
 
     rates: Rates | Sequence[Reaction]
@@ -145,6 +147,7 @@ class BoundReactions(BoundEffect):
     effect: MediumReactions
     first: BoundReactions | None = None  # the other half, which was traced before
     acts_without_cells = False  # whether the medium changes from the start
+    sub_steps = 1  # of each step, in which reactions and transport take turns
 
     def __init__(self, effect: MediumReactions, binding: Binding):
         super().__init__(effect, binding)
@@ -339,12 +342,19 @@ class BoundReactions(BoundEffect):
 
     def numerics(self, dt: float, state: State) -> list[str]:
         if self.stage != LAST_REACTIONS:
-            return [f"over {dt / 2:g} h, by the method that the second half lists"]
-        e, rate = self.effect, self._fastest(state)
+            half = dt / 2 / self.sub_steps
+            return [f"over {half:g} h, by the method that the second half lists"]
+        e, rate, sub_steps = self.effect, self._fastest(state), self.sub_steps
+        changed = rate * dt / sub_steps
+        enough = math.ceil(sub_steps * changed / SMALL) if changed < math.inf else 1
+        hint = f": Medium(steps={enough})" if enough > sub_steps else ""
+        what, over = ("sub-step", dt / sub_steps) if sub_steps > 1 else ("step", dt)
         return [
-            "half of the step before transport and exchange, half after (Strang)",
-            f"fastest rate at these concentrations {rate:.2g}/h, {rate * dt:.2g} in a step: what"
-            " transport balances, as in patterns and profiles, needs 0.1 or less",
+            f"{sub_steps} sub-steps of {over:g} h, in turns with transport, timed with it (Strang)"
+            if sub_steps > 1
+            else "half of the step before transport and exchange, half after (Strang)",
+            f"fastest rate at these concentrations {rate:.2g}/h, {changed:.2g} in a {what}: what"
+            f" transport balances, as in patterns and profiles, needs {SMALL:g} or less{hint}",
             f"stiff solver (Rodas3), each voxel in steps of its own: error at most {e.atol:g} +"
             f" {e.rtol:g}·|s| in each; nothing below 0",
             f"computed by torch: {self.by_torch}"
@@ -372,7 +382,11 @@ class BoundReactions(BoundEffect):
         return float(torch.linalg.eigvals(slopes).abs().max())
 
     def step(self, state: State, dt: float) -> State:
-        """The state after half of dt hours of reactions."""
+        """The state after half of a sub-step of reactions."""
+        return self.react(state, 0.5 * dt / self.sub_steps)
+
+    def react(self, state: State, hours: float) -> State:
+        """The state after reactions alone."""
         layout = state.layout
         assert layout is not None
         if not self.written:
@@ -382,7 +396,7 @@ class BoundReactions(BoundEffect):
         before = torch.stack([state.fields[OUTSIDE + n] for n in self.species], 1)
         before = before if rows is None else before.index_select(0, rows)
         settings = run.IntegrationSettings("rosenbrock", 1, self.effect.rtol, self.effect.atol, 1.0)
-        made = run.step(voxels, before, 0.5 * dt, settings)
+        made = run.step(voxels, before, hours, settings)
         changed = {}
         for k, name in enumerate(self.species):
             if name in self.written:
@@ -390,7 +404,7 @@ class BoundReactions(BoundEffect):
                 value = torch.where(made.failed, before[:, k], made.concentrations[:, k])
                 value = value.to(old.dtype).contiguous()
                 changed[OUTSIDE + name] = value if rows is None else old.index_copy(0, rows, value)
-        report = self._report(state, voxels, made, before, 0.5 * dt)
+        report = self._report(state, voxels, made, before, hours)
         reports = {**state.reports, self.effect.title: report}
         return state.with_fields(**changed).replace(reports=reports)
 
@@ -401,8 +415,8 @@ class BoundReactions(BoundEffect):
         assert state.layout is not None
         words: dict[int, str] = {}
         status = torch.zeros_like(state.counts)
-        earlier = state.reports.get(self.effect.title)
-        if self.stage == LAST_REACTIONS and isinstance(earlier, MediumReactionsReport):
+        earlier = state.reports.get(self.effect.title)  # of the same step
+        if isinstance(earlier, MediumReactionsReport):
             words, status = dict(earlier.words), earlier.status.clone()
         if bool(made.failed.any()):
             at = torch.nonzero(made.failed).squeeze(1)

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import Binding
-from torchfilm.effects.medium_values import Corner, later, on_grid, without_cells
-from torchfilm.effects.scaled import held_tensors, scaled
+from torchfilm.effects.medium_values import Corner, later, on_grid, velocity_of, without_cells
+from torchfilm.effects.scaled import held_tensors
 from torchfilm.resolver import snapshot
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.grid import Grid, GridBatch
@@ -41,6 +41,7 @@ from torchfilm.values import Distribution, numbers
 
 if TYPE_CHECKING:
     from torchfilm.effects.medium import Medium
+    from torchfilm.effects.medium_substeps import SubSteps
 from torchfilm.effects.signal import Flow, OnGrid, Signal
 
 # Methods that are exact over a step, whatever its length.
@@ -115,6 +116,7 @@ class Transport:
         # signals that take turns with circuits, in the medium's steps; that others move, by whom
         self.in_turns: frozenset[str] = frozenset()
         self.coupled: dict[str, str] = {}
+        self.apart: SubSteps | None = None  # of reactions and transport, about what cells do
         self._of_step: dict[Any, Carrier] | None = None
         # weak keys: a grid no longer in use releases its steps
         self.carriers: WeakKeyDictionary[Grid, dict[Any, Carrier]] = WeakKeyDictionary()
@@ -204,23 +206,28 @@ class Transport:
     ) -> State:
         """The state after transport, in which cells do not change: of the signals that take turns
         with cells for `turn` hours, in so many pieces where the method is not exact; of the others
-        for so many `hours`, in the medium's steps. names: of the signals to move; None: all."""
-        assert state.layout is not None
-        grid, steps = state.layout.grid, self.medium.steps
-        changed = {}
-        for name in sorted(
-            self.medium.signals.keys() - self.coupled.keys() if names is None else names
-        ):
+        for so many `hours`, in the medium's steps. names: of the signals to move; None: all but
+        those that sub-steps move."""
+        steps = self.medium.steps
+        changed: dict[str, Tensor] = {}
+        if names is None:
+            apart = self.apart.names if self.apart else ()
+            names = frozenset(self.medium.signals).difference(self.coupled, apart)
+        for name in sorted(names):
             often = name in self.in_turns
             whole, count = (turn, pieces) if often else (hours, steps)
             count = 1 if often and self.medium.method_of(name)[0] in EXACT else count
-            part = whole / count
-            values = state.fields[OUTSIDE + name]
-            carriers = [self.carrier(name, state, batch, part) for batch in grid.batches]
-            for _ in range(count):
-                values = carry(grid, carriers, values)
-            changed[OUTSIDE + name] = values
+            changed |= self.moved(name, state, whole, count)
         return state.with_fields(**changed)
+
+    def moved(self, name: str, state: State, hours: float, pieces: int) -> dict[str, Tensor]:
+        """A signal after transport in so many pieces, by the name of its field."""
+        assert state.layout is not None
+        grid, values = state.layout.grid, state.fields[OUTSIDE + name]
+        carriers = [self.carrier(name, state, batch, hours / pieces) for batch in grid.batches]
+        for _ in range(pieces):
+            values = carry(grid, carriers, values)
+        return {OUTSIDE + name: values}
 
     def with_uptake(self, name: str, state: State) -> list[UptakeTransport]:
         """Transport of a signal that cells take up, on the grids of each shape; it is reused while
@@ -396,7 +403,7 @@ class Transport:
             layout.grid.spacing,
             diffusion=own(signal.diffusion),
             decay=spread("decay"),
-            velocity=_velocity(now.flows[name], layout, batch, own),
+            velocity=velocity_of(now.flows[name], layout, batch, own),
             boundary=now.boundary[name].take(ids),
             mask=None if layout.mask is None else batch.of(layout.mask),
             source=(
@@ -410,25 +417,6 @@ class Transport:
             dtype=state.dtype,
             device=state.device,
         )
-
-
-def _velocity(flow: Flow, layout: Layout, batch: GridBatch, own: Callable[[Any], Any]) -> Any:
-    """The velocity for the operator: None, uniform (b, 3), or on the faces of the voxels, three
-    tensors."""
-    if flow is None:
-        return None
-    if not callable(flow):
-        parts = [
-            torch.as_tensor(own(v), dtype=torch.float64, device=layout.grid.origin.device)
-            .reshape(-1)
-            .expand(batch.colonies.numel())
-            for v in (*flow, 0.0)[:3]
-        ]
-        return torch.stack(parts, 1)
-    factor = lambda x: torch.as_tensor(own(x), device=layout.grid.origin.device).reshape(
-        -1, 1, 1, 1
-    )
-    return tuple(scaled(flow, found, factor) for found in layout.on_faces(flow, batch))
 
 
 def _first_values(

@@ -3,7 +3,7 @@ is."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -12,13 +12,15 @@ import torch
 from torch import Tensor
 
 from torchfilm.effects.scaled import scaled
+from torchfilm.signals.grid import GridBatch
+from torchfilm.signals.layout import Layout
 from torchfilm.signals.schedule import ROUNDING, Schedule
 from torchfilm.state import State
 from torchfilm.tools import checks, random
 from torchfilm.values import Distribution, PerColony
 
 if TYPE_CHECKING:
-    from torchfilm.effects.signal import OnGrid, Signal
+    from torchfilm.effects.signal import Flow, OnGrid, Signal
 
 Corner = Sequence[float]
 BITS = 21  # of the number of a voxel along an axis, in its key
@@ -181,3 +183,22 @@ def _over(
         lasted = torch.where(rate > 0, -torch.expm1(-some * hours) / some, few)
         kept, made = kept * part, made * part + source * lasted
     return kept, made
+
+
+def velocity_of(flow: Flow, layout: Layout, batch: GridBatch, own: Callable[[Any], Any]) -> Any:
+    """The velocity for the operator: None, uniform (b, 3), or on the faces of the voxels, three
+    tensors."""
+    if flow is None:
+        return None
+    if not callable(flow):
+        parts = [
+            torch.as_tensor(own(v), dtype=torch.float64, device=layout.grid.origin.device)
+            .reshape(-1)
+            .expand(batch.colonies.numel())
+            for v in (*flow, 0.0)[:3]
+        ]
+        return torch.stack(parts, 1)
+    factor = lambda x: torch.as_tensor(own(x), device=layout.grid.origin.device).reshape(
+        -1, 1, 1, 1
+    )
+    return tuple(scaled(flow, found, factor) for found in layout.on_faces(flow, batch))
