@@ -394,3 +394,37 @@ def test_other_weights_are_another_scene_and_training_is_no_edit(tmp_path):
         file.attrs["code"] = json.dumps(json.loads(file.attrs["code"])[:3])
     with tf.Results(path) as results:
         assert results.state(scene).step == 2
+
+
+def test_a_frame_is_measured_without_its_scene(whole):
+    """All that the file holds is there, and a run goes on from it."""
+    path, states = whole
+    with tf.Results(path) as results:
+        bare, full = results.state(frame=3), results.state(make_scene(), 3)
+    assert_same_state(bare, full)
+    assert (bare.time, bare.step, bare.seed) == (full.time, full.step, full.seed)
+    assert torch.equal(tf.measure.colony_radius(bare), tf.measure.colony_radius(full))
+    *_, last = tf.simulate(make_scene(), bare, until=UNTIL)
+    assert_same_state(last, states[-1])
+
+
+def test_a_frame_with_a_medium_and_one_in_a_periodic_space(tmp_path):
+    signals = {"a": tf.Signal(20.0, initial=lambda x: x[:, 0] ** 2), "b": tf.Signal(2.0)}
+    box = {"box": [[-10.0, -12.0], [10.0, 12.0]], "spacing": 2.0, "height": 0.5, "depth": 1.0}
+    faces = tf.BoundaryConditions(x=tf.Periodic())
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Medium(**signals, **box, boundary=faces),
+        tf.Mechanics(dim=2, periodic={"x": (-10.0, 10.0)}),
+    )  # fmt: skip
+    tf.simulate(scene, until=3.0, colonies=2, record=tmp_path / "run.h5").last()
+    with tf.Results(tmp_path / "run.h5") as results:
+        bare, full = results.state(), results.state(scene)
+        with pytest.raises(tf.InputError, match=r"scene = 3 .* results\.state\(frame=…\)"):
+            results.state(3)
+    assert bare.space.faces == full.space.faces
+    assert torch.equal(bare.position_3d, full.position_3d)
+    assert bare.layout.periodic == full.layout.periodic == (True, False, False)
+    assert torch.equal(bare.layout.grid.origin, full.layout.grid.origin)
+    assert all(torch.equal(bare.signals[n], full.signals[n]) for n in "ab")
+    assert torch.equal(tf.measure.overlaps(bare).worst, tf.measure.overlaps(full).worst)
+    assert float(tf.measure.overlaps(bare).worst.max()) > 0.0

@@ -16,8 +16,10 @@ from torchfilm.binding_checks import another_quantity
 from torchfilm.initial_cells import Cells
 from torchfilm.io.identity import check_fields, check_same_scene, declared_fields
 from torchfilm.io.schema import check_frame
+from torchfilm.physics.space import PeriodicSpace
 from torchfilm.scene import Scene
 from torchfilm.signals.grid import Grid
+from torchfilm.signals.layout import Layout
 from torchfilm.state import OUTSIDE, PER_CELL, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.warn_once import quietly, warn
@@ -63,11 +65,16 @@ def _warn_of_places(ids: list[int], colony: np.ndarray) -> None:
 
 
 def restore_state(
-    results: Results, scene: Scene, frame: int, device: str | torch.device | None, changed: bool
-) -> State:
+    results: Results, scene: Scene | None, frame: int, device: str | torch.device | None,
+    changed: bool,
+) -> State:  # fmt: skip
     """The state at a frame; see `Results.state`."""
     device = torch.device(device if device is not None else "cpu")
-    template = _template(results, scene, device, changed)
+    template = (
+        _bare(results, frame, device)
+        if scene is None
+        else _template(results, scene, device, changed)
+    )
 
     def tensor(value: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(value)).to(device)
@@ -85,7 +92,8 @@ def restore_state(
         }
     recorded |= results.colony_fields(frame)
     declared = dict(template.declared)
-    kept = [name for effect in scene.effects for name in effect.keeps().values()]
+    effects = () if scene is None else scene.effects
+    kept = [name for effect in effects for name in effect.keeps().values()]
     for name, about in declared_fields(results.attributes).items():
         there, known = partial(_field, name, about, recorded), declared.get(name)
         # what is another quantity to a changed scene is refused where that goes on
@@ -127,6 +135,26 @@ def _template(results: Results, scene: Scene, device: torch.device, changed: boo
     if not changed:
         check_same_scene(about, results.path, scene)
     return template
+
+
+def _bare(results: Results, frame: int, device: torch.device) -> State:
+    """A state without cells in the space of a frame, as far as the file knows it."""
+    periodic, dim = results.periodic, int(results.attributes["dim"])
+    layout, none = None, torch.empty(0, device=device)
+    if results.signal_names:
+        origin, shape, spacing = results.grid(frame)
+        x, y, z = map(float, spacing)
+        low, counts = (torch.from_numpy(a).to(device) for a in (origin, shape))
+        grid = Grid(low, counts, (x, y, z))
+        # cells in two dimensions lie in the middle of a single layer
+        flat = dim == 2 and bool((shape[:, 2] == 1).all())
+        height = float(origin[0, 2]) + z / 2 if flat else 0.0
+        layout = Layout(grid, ("x" in periodic, "y" in periodic, "z" in periodic), height)
+    return State(
+        colony=none, uid=none, parent=none, position=none, axis=none, length=none, radius=none,
+        colony_id=none, stream=none, next_uid=none, seed=int(results.attributes["seed"]),
+        layout=layout, space=PeriodicSpace.of("periodic", periodic or None, dim),
+    )  # fmt: skip
 
 
 def _field(name: str, about: list, recorded: Mapping[str, np.ndarray]) -> Field:

@@ -423,7 +423,7 @@ class Results(metaclass=checks.KnownKeywords):
     @partial(checks.known_keywords, instead=BY_NUMBER)
     def state(
         self,
-        scene: Scene,
+        scene: Scene | None = None,
         frame: int = -1,
         *,
         device: str | torch.device | None = None,
@@ -431,10 +431,10 @@ class Results(metaclass=checks.KnownKeywords):
     ) -> State:
         """The state at a frame. `simulate` continues from it as if the run had not stopped.
 
-        scene: the recorded one; with `changed`, any scene with the same fields. device: "cpu" by
-        default. Raises InputError for another scene, and names what differs.
+        scene: the recorded one; with `changed`, any with the same fields; None: to measure, without
+        obstacles. device: "cpu" by default. Raises InputError for a scene that differs, says how.
         """
-        if not isinstance(scene, Scene):
-            hint = "Write results.state(scene) for the last frame, or results.state(scene, frame)."
+        if scene is not None and not isinstance(scene, Scene):
+            hint = "Write results.state(scene, frame), or results.state(frame=…) to measure it."
             raise checks.input_error("scene", scene, "the Scene that was recorded", hint)
         return restore_state(self, scene, self._index(frame), device, changed)
