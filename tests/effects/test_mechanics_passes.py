@@ -377,3 +377,25 @@ def test_passes_do_not_depend_on_the_batch(device, dtype, given):
         together = state.select([k])
         for what in ("position", "axis", "length"):
             assert torch.equal(getattr(alone, what), getattr(together, what)), (k, what)
+
+
+def test_sub_steps_take_off_no_growth():
+    """A film under pressure, in a space 20 µm wide: the volume is that of shorter steps."""
+
+    def volume(dt: float, **options) -> float:
+        first = tf.Cells([[-7.0 + 5.0 * k, 0.6] for k in range(4)], [[1.0, 0.0]] * 4, length=2.0)
+        floor = tf.Plane(normal=(0.0, 1.0), point=(0.0, 0.0))
+        space = {"periodic": {"x": (-10.0, 10.0)}, "walls": [floor], "length_drag": 1e3}
+        scene = tf.Scene(
+            tf.Growth(rate=1.0),
+            tf.Division(length=tf.Uniform(3.5, 4.5), conserves="volume"),
+            tf.Mechanics(dim=2, **space, **options), founders=first, dt=dt,
+        )  # fmt: skip
+        state = tf.simulate(scene, until=5.0, colonies=4, seed=1).last()
+        divided = int(state.reports["mechanics"].substeps.min()) > 1
+        assert divided == (dt > 0.0125)
+        return float(state.volume.sum())
+
+    wanted = volume(0.0125)
+    assert volume(0.025, max_elongation=0.05) == pytest.approx(wanted, rel=0.02)
+    assert volume(0.05) == pytest.approx(wanted, rel=0.05)

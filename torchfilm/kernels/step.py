@@ -49,12 +49,13 @@ from torchfilm.kernels.rows import (
     wall_rows,
 )
 from torchfilm.kernels.scheme import (
-    DEEP_IN_SUBSTEPS,
+    DEEP_AFTER_MANY,
     HARDEST,
     HOPS,
     ITERATION_LIMIT,
     LAG,
     LONG_MOVES,
+    MANY_SUBSTEPS,
     MARGIN,
     MOST_HOPS,
     MOST_SOFTER,
@@ -76,9 +77,8 @@ from torchfilm.kernels.solve_parts import overlaps
 from torchfilm.kernels.team import next_of
 from torchfilm.kernels.wall_moves import move_cells
 
-# Places in the settings. DEEP ≤ 0: TOO_DEEP radii. YIELD: mean overlap
-# of contacts, radii.
-# PERIODS: the first of three, see `kernels.images`.
+# Places in the settings. DEEP ≤ 0: TOO_DEEP radii. YIELD: mean overlap of contacts, radii. PERIODS:
+# the first of three, see `kernels.images`.
 DEEP, TOLERANCE, MOST_PASSES, LIMIT, SOFT, YIELD, PERIODS = range(7)
 
 
@@ -418,12 +418,12 @@ def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, 
             bonds = bonds_of(memory, of, dt / steps, given, own_x, own_axis, length, drift, dof)
             reach = reach_of(bonds, drift, dof)
             own_settings = copied(memory, settings, settings.shape[0])
-            if steps > 1 and settings[DEEP] <= 0:
-                own_settings[DEEP] = DEEP_IN_SUBSTEPS * _mean(own_radius)
             top = memory[1][TOP]
             if steps > 1:
                 move_along(own_x, own_axis, drift, -1.0, dof)
-            for _ in range(steps):
+            for k in range(steps):
+                if settings[DEEP] <= 0 and k + 1 == steps >= MANY_SUBSTEPS:
+                    own_settings[DEEP] = DEEP_AFTER_MANY * _mean(own_radius)
                 give_back(memory, top)
                 report[ALPHA] = 0.0
                 if steps > 1:

@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from torchfilm.kernels.scheme import (
-    DEEP_IN_SUBSTEPS,
+    DEEP_AFTER_MANY,
     HARDEST,
     HOPS,
     LAG,
     LONG_MOVES,
+    MANY_SUBSTEPS,
     MARGIN,
     MAX_TURN,
     MOST_HOPS,
@@ -68,7 +69,10 @@ def contact_steps(given: StepInput) -> StepResult:
     for k in range(int(steps.max()) if steps.numel() else 0):
         if given.drift is not None:
             at = _drifted(at, given, torch.where((steps > 1) & (k < steps), share, 0.0))
-        at = _OneStep(given, at.length, growth, (k < steps) & (at.status != NOT_FINITE)).taken(at)
+        active = (k < steps) & (at.status != NOT_FINITE)
+        last_of_many = (k + 1 == steps) & (steps >= MANY_SUBSTEPS)
+        deep = torch.where(last_of_many, DEEP_AFTER_MANY, TOO_DEEP)
+        at = _OneStep(given, at.length, growth, deep, active).taken(at)
     return at
 
 
@@ -87,9 +91,11 @@ def _drifted(at: StepResult, given: StepInput, share: Tensor) -> StepResult:
 
 
 class _OneStep:
-    """One sub-step of the active colonies, (B,) bool, from cells of this length, (N,)."""
+    """One sub-step of the active colonies, (B,) bool, from cells of this length (N,); deep (B,)."""
 
-    def __init__(self, given: StepInput, length: Tensor, growth: Tensor, active: Tensor):
+    def __init__(
+        self, given: StepInput, length: Tensor, growth: Tensor, deep: Tensor, active: Tensor
+    ):
         self.given, self.groups, self.dim = given, given.groups, given.settings.dim
         self.growth, self.active = growth, active
         count = self.groups.counts.clamp(min=1)
@@ -104,12 +110,8 @@ class _OneStep:
         least = torch.where(some, UNMOVED * self.target / torch.where(some, held, 1.0), torch.inf)
         self.hardest = torch.minimum(HARDEST * self.softest, least)
         with torch.no_grad():
-            overlap = given.settings.overlap
-            self.deep = (
-                torch.where(given.steps > 1, DEEP_IN_SUBSTEPS, TOO_DEEP) * self.wide
-                if overlap is None
-                else torch.full_like(self.wide, overlap)
-            )
+            own = given.settings.overlap
+            self.deep = deep * self.wide if own is None else torch.full_like(self.wide, own)
         self.of_cells = lambda x: self.groups.spread(x).to(given.radius.dtype)
 
     def taken(self, at: StepResult) -> StepResult:
