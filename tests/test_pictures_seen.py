@@ -67,8 +67,10 @@ def test_directions_look_different_to_colour_blind_readers_too(eyes, least):
 
 @pytest.mark.parametrize("eyes", [DEUTERANOPE, PROTANOPE])
 def test_the_first_types_look_different_to_colour_blind_readers_too(eyes):
-    listed = np.array([matplotlib.colors.to_rgb(c) for c in colours.KINDS])
-    found = apart(listed, eyes) + 1e3 * np.eye(len(listed))
+    seen = colours.range_of("cell_type")
+    seen.add(np.arange(8))
+    drawn = colours.scale_of("cell_type", seen, PlotStyle(colour="cell_type"), {})
+    found = apart(drawn.paint(np.arange(8))[:, :3], eyes) + 1e3 * np.eye(8)
     assert found.min() > 10.0
 
 

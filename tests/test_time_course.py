@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import torchfilm as tf
+from torchfilm.pictures.categories import KINDS
 
 matplotlib = pytest.importorskip("matplotlib")
 
@@ -169,3 +170,14 @@ def test_replicates_are_thin_lines_of_one_colour_beside_their_mean(tmp_path):
     # by kind, they are told apart by their colonies
     split = tf.pictures.time_course(path, "gfp", by="cell_type").figure.axes[0].get_legend().texts
     assert [t.get_text().split(", ")[1] for t in split] == ["colony 0", "colony 1", "colony 2"]
+
+
+def test_types_have_the_colours_of_pictures(tmp_path):
+    """Of types 0 and 2, the second is not drawn as type 1 would be."""
+    founders = tf.Cells([[0.0, 0.0], [20.0, 0.0]], [[1.0, 0.0]] * 2, cell_type=[0, 2])
+    scene = tf.Scene(tf.Growth(rate=1.0), dim=2, founders=founders)
+    path = tmp_path / "types.h5"
+    tf.simulate(scene, until=0.2, record=path).last()
+    drawn = tf.pictures.time_course(path, by="cell_type").figure.axes[0].lines
+    colours = [matplotlib.colors.to_hex(line.get_color()).upper() for line in drawn]
+    assert colours == [KINDS[0], KINDS[2]]

@@ -452,3 +452,19 @@ def test_gradients_go_through_maintenance():
         )
     )
     assert float(slope) == pytest.approx((more - less) / 2e-4, rel=1e-5) and float(slope) < -0.1
+
+
+def test_it_begins_with_the_rates_of_the_first_concentrations():
+    """Rules and the first frame find them; of what cells lack, the other part."""
+    first = lambda x: torch.where(x[:, 0] < 0.0, 0.05, 2.0)
+    scene = tf.Scene(
+        tf.Growth(),
+        tf.Rules(lambda cells: None, variables={"vigour": 0.5}),
+        tf.Monod("food", rate=1.2, half=0.4, factor="vigour", maintenance=0.1),
+        tf.Medium(food=tf.Signal(0.0, initial=first), spacing=2.0, box=((-8, -8), (8, 8))),
+        founders=tf.Cells([[-5.0, 1.0], [5.0, 1.0]], [[1.0, 0.0]] * 2, length=2.0), dim=2,
+    )  # fmt: skip
+    state = scene.bind(1, dtype=torch.float64).start()
+    gross = [0.5 * 1.2 * s / (0.4 + s) for s in (0.05, 2.0)]
+    assert state.growth_rate.tolist() == pytest.approx([0.0, gross[1] - 0.1])
+    assert state.starvation.tolist() == pytest.approx([0.1 - gross[0], 0.0])

@@ -204,6 +204,24 @@ class BoundMonod(BoundEffect):
                     " tf.Monod(…, factor='factor')."
                 )
 
+    def trace(self, state: State) -> State:
+        return state  # a rate of Growth's own is still to be seen
+
+    def ready(self, state: State) -> State:
+        """With the growth rate at the first concentrations, which rules and frames find."""
+        medium = MediumExchange(state, (self.effect.signal,))
+        medium.find()
+        found = medium.found[self.effect.signal].double()
+        eaters = self._eaters(state, medium, torch.ones_like(found), 0.0)
+        gross, needed = eaters.greatest * found / (eaters.half + found), self._maintenance(state)
+        changed = {"growth_rate": gross}
+        if needed is not None:
+            changed = {
+                "growth_rate": (gross - needed).clamp(min=0.0),
+                STARVATION: (needed - gross).clamp(min=0.0),
+            }
+        return state.with_fields(**{n: x.to(state.fields[n].dtype) for n, x in changed.items()})
+
     def step(self, state: State, dt: float) -> State:
         parts = self.transport.medium.steps
         for done in range(parts):

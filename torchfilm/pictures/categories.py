@@ -16,23 +16,24 @@ MOST_TYPES = 24
 GOLDEN = 0.618034  # of a turn, from one hue to the next
 # Saturation and value, in turn: with the hues they tell sixty numbers apart, by a ΔE of 8 and more.
 SHADES = ((0.9, 0.95), (0.6, 0.9), (0.35, 0.85), (0.9, 0.75), (0.6, 0.6))
-APART = 0.45  # the least distance between two categories, as red, green and blue
+APART = 0.45  # of a colour that is not listed from all others, as red, green and blue
 
 
 def colours_of_kinds(kinds: Sequence[int], keep: bool = False) -> list[Any]:
-    """The colours of categories, by their numbers; beyond the list hues that are apart from those
-    before. keep: each number has one colour, whatever else there is."""
+    """The colours of categories, by their numbers: those listed, and for others hues that are apart
+    from these. keep: each number has one colour, whatever else there is."""
     if keep:
         known = colours_of_kinds(range(MOST_TYPES))
         each = (known[k] if 0 <= k < MOST_TYPES else colour_of_kind(k, 0) for k in kinds)
         return list(each)
-    found: list[Any] = []
+    found = {k: colour_of_kind(k, 0) for k in kinds if 0 <= k < len(KINDS)}
     for kind in kinds:
-        made = [colour_of_kind(kind, k) for k in range(12)]
-        far = [min((math.dist(c, x) for x in found), default=1.0) for c in made]
-        found.append(next((c for c, x in zip(made, far, strict=True) if x >= APART),
-                          made[int(np.argmax(far))]))  # fmt: skip
-    return found
+        if kind not in found:
+            made = [colour_of_kind(kind, k) for k in range(12)]
+            far = [min((math.dist(c, x) for x in found.values()), default=1.0) for c in made]
+            good = (c for c, x in zip(made, far, strict=True) if x >= APART)
+            found[kind] = next(good, made[int(np.argmax(far))])
+    return [found[kind] for kind in kinds]
 
 
 def colours_by_number(numbers: np.ndarray) -> np.ndarray:

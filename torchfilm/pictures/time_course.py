@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from torchfilm.io.results import Results
-from torchfilm.pictures.colours import KINDS
+from torchfilm.pictures.categories import KINDS, colours_of_kinds
+from torchfilm.pictures.colours import TYPES
 from torchfilm.pictures.figures import check_not_results, choose_colonies, opened
 from torchfilm.pictures.frames import RecordedFrames
 from torchfilm.pictures.page import checked_dpi
@@ -177,7 +178,7 @@ def _lines(
     return [
         CourseLine(p, kind, f"{name(p)}, {by} {kind}" if several else f"{by} {kind}", c, style)
         for p, style in zip(places, STYLES, strict=False)
-        for kind, c in zip(kinds, _colours(len(kinds)), strict=True)
+        for kind, c in zip(kinds, _colours_of(kinds, by), strict=True)
     ]
 
 
@@ -201,6 +202,13 @@ def _seen(
                     found[1 + row] = values.mean(), *np.percentile(values, BAND)
             out[place, one] = found
     return out
+
+
+def _colours_of(kinds: Sequence[int], by: str) -> list[Any]:
+    """A colour for each kind, as in pictures of cells; where there are many, a ramp."""
+    if by == TYPES or len(kinds) <= len(KINDS):
+        return colours_of_kinds(kinds, by == TYPES)
+    return _colours(len(kinds))
 
 
 def _colours(count: int) -> list[Any]:

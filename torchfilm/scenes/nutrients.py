@@ -86,9 +86,9 @@ def biofilm(
     The nutrient is kept at `supply` at the distance `layer`, µm, above the centre of the highest
     cell, to a voxel: beyond, all is mixed. With layer=None it is kept so at `height`. Cells grow by
     `rate` (1/h) · s/(half + s), down to a depth of about √(2 · diffusion · s · growth_yield /
-    rate), with the s at the surface. Where that is many cells the film is flat; where it is one or
-    two, bumps shade what lies lower and become fingers. Cells whose centre comes within 4 µm of
-    `height` are carried away.
+    (rate·φ)), with the s at the surface, and φ = 0.66 the share of the slice that cells fill. Where
+    that is many cells the film is flat; where it is one or two, bumps shade what lies lower and
+    become fingers. Cells whose centre comes within 4 µm of `height` are carried away.
 
     Only the product of diffusion, supply and yield matters, while the nutrient that is there at
     first is little: it feeds a film of supply · growth_yield · its own height.
