@@ -13,8 +13,9 @@ import numpy as np
 import torchfilm as tf
 from design.fit_plot import Curve, are_curves, draw_readings, measures_of, spread_over
 from design.growing import FinishedColonies
-from design.parameters import Parameter, show_value
+from design.parameters import Choice, Parameter, Space, show_value
 from design.report import (
+    ReportedDesign,
     SearchReport,
     best_trivial,
     each_measured,
@@ -259,7 +260,7 @@ def _draw_convergence(ax: Axes, report: SearchReport) -> None:
         ax.annotate(
             f"without a pattern: {name}", (1.0, answers[name]), xycoords=("axes fraction", "data"),
             xytext=(-2, -2), textcoords="offset points", ha="right", va="top", fontsize=7,
-            color="0.3",
+            color="0.3", bbox={"fc": "white", "ec": "none", "alpha": 0.8, "pad": 0.6},
         )  # fmt: skip
     some = y[np.isfinite(y)]
     wide = len(some) > 0 and some.min() > 0 and some.max() > WIDE * some.min()
@@ -269,13 +270,20 @@ def _draw_convergence(ax: Axes, report: SearchReport) -> None:
     ax.set_title(words[1], fontsize=9)
 
 
+def _places(space: Space, shown: ReportedDesign) -> list[float]:
+    """Between the bounds, from 0 to 1; of a choice that of the option that is used, to which the
+    task may have resolved what the search had drawn."""
+    each = zip(space.parameters, shown.point, strict=True)
+    return [p.coordinate(shown.values[p.name]) if isinstance(p, Choice) else x for p, x in each]
+
+
 def _draw_parameters(ax: Axes, report: SearchReport) -> None:
     """The best design and the first guess between the bounds."""
     space, first, best = report.task.space, report.first, report.best
     rows = np.arange(space.size)[::-1]
     ax.hlines(rows, 0, 1, color="0.85", lw=4, zorder=0)
-    ax.plot(first.point, rows, "o", color="0.55", label=first.title)
-    ax.plot(best.point, rows, "D", color="C3", label=best.title)
+    ax.plot(_places(space, first), rows, "o", color="0.55", label=first.title)
+    ax.plot(_places(space, best), rows, "D", color="C3", label=best.title)
     for y, p in zip(rows, space.parameters, strict=True):
         low, high = (
             (f"{p.low:g}", f"{p.high:g}")

@@ -457,3 +457,18 @@ def test_a_colony_without_the_type_that_a_stripe_needs_has_failed():
     assert "no border" in words[2]
     words = Stripe("yfp", at=0.0, width=4.0, cell_type=1).unfit(state)
     assert "no cells of type 1" in words[2] and not any(words[:2])
+
+
+def test_a_marker_lies_at_the_option_that_is_used():
+    """The task uses the second option where the search has drawn the first."""
+    other = lambda values: {"promoter": "strong"}
+    choice = Choice("promoter", ("weak", "strong"), resolve=other)
+    best = searched(built, [Parameter("make", 1, 2), choice], Two("g0"), fixed={"genes": 2},
+                    method=Given([0.5, 0.1], [0.2, 0.3]))  # fmt: skip
+    assert best.values["promoter"] == "strong"
+    figure = draw(best._report())
+    (axes,) = (ax for ax in figure.axes if "promoter = strong" in
+               [t.get_text() for t in ax.get_yticklabels()])  # fmt: skip
+    for line in axes.lines[:2]:
+        x, y = line.get_data()
+        assert float(x[int(np.argmin(y))]) == 0.75
