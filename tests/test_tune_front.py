@@ -58,7 +58,10 @@ def test_the_table_says_what_accuracy_costs_as_the_user_would_type_it(priced):
         ["0.2", "%", "(m)", "4.5", "0.005", "0.014", "0.07", "0.0001"],
     ]
     assert "2 s for the window" in lines[at + 6]
-    assert lines[at + 7] == "  dt in h, contact_overlap in radii of cells)"
+    assert lines[at + 7] == (
+        "  dt in h, contact_overlap in radii of cells; of settings with much the same error one is"
+        " shown)"
+    )
 
 
 def test_the_picture_has_what_ran_the_front_and_both_settings(priced, tmp_path):

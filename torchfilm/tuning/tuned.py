@@ -162,7 +162,7 @@ def _front_lines(tuned: Tuned) -> list[str]:
         f" own settings, {tuned.own.seconds:.2g} s for the window, and varies somewhat;",
     ]
     radii = ", contact_overlap in radii of cells" if "contact_overlap" in rows[0] else ""
-    return [*lines, f"  dt in h{radii})"]
+    return [*lines, f"  dt in h{radii}; of settings with much the same error one is shown)"]
 
 
 def _aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
