@@ -31,7 +31,7 @@ docs: $(STAMP)  ## build the documentation into site/
 	$(BIN)/mkdocs build --strict -q
 
 bench: $(STAMP)  ## the benchmarks of growth and of design, small sizes
-	$(BIN)/python experiments/benchmarks/growth.py --quick
+	$(BIN)/python experiments/benchmarks/growth.py --quick --out runs/growth.json
 	$(BIN)/python experiments/benchmarks/search.py rate --cells 100 --designs 16 --out runs/rate.json
 
 clean:  ## remove what was built

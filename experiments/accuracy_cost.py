@@ -25,6 +25,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
+from arguments import out_folder
 
 import torchfilm as tf
 
@@ -74,7 +75,9 @@ def main() -> None:
         help="few settings on small colonies, as a test; writes to runs/accuracy, not to the page",
     )
     parser.add_argument(
-        "--out", type=Path, help="folder for CSV files and pictures; leaves the page unchanged"
+        "--out",
+        type=out_folder,
+        help="folder for CSV files and pictures; leaves the page unchanged",
     )
     parser.add_argument(
         "--write-only",

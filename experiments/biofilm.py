@@ -6,8 +6,8 @@
     OMP_NUM_THREADS=1 python experiments/biofilm.py --losses            # some seconds
 
 Colonies of the scene `biofilm`, four for each coefficient, run for 20 h. The script prints
-thickness and roughness of the films every five hours, with the standard deviation over colonies,
-and the speed at which it ran. It draws one colony of each coefficient at the end:
+thickness and roughness of the films every five hours and at the end, with the standard deviation
+over colonies, and the speed at which it ran. It draws one colony of each coefficient at the end:
 docs/pictures/biofilm.png. With --rest it prints how thick films are that erode, once they have come
 to rest. With --losses it draws two films that erode, starve, die and slough:
 docs/pictures/biofilm_losses.png.
@@ -20,12 +20,14 @@ import time
 from pathlib import Path
 
 import torch
+from arguments import out_file, positive
 from torch import Tensor
 
 import torchfilm as tf
 from torchfilm import pictures
 
-PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "biofilm.png"
+PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
+HOURS, EVERY = 20.0, 100  # h; steps between two lines, 5 h
 DIFFUSION, REPLICATES, SEED = (1e3, 3e3, 1e4, 1e5), 4, 0
 MANY = 20  # cells that slough at once
 EROSION, AT_REST, END = (0.005, 0.01, 0.02, 0.04), 25.0, 40.0  # 1/(µm·h), h, h
@@ -54,7 +56,14 @@ def at_rest() -> None:
         print(f"diffusion {diffusion:g} µm²/h: thickness {in_words(torch.stack(found).mean(0))} µm")
 
 
-def losses() -> None:
+def say(state: tf.State) -> None:
+    """Print thickness and roughness, by coefficient."""
+    film = tf.measure.film(state)
+    print(f"{state.time:4.1f} h: thickness {in_words(film.thickness)} µm")
+    print(f"        roughness {in_words(film.roughness)}")
+
+
+def losses(picture: Path) -> None:
     """Draw two films that erode, and in which cells that starve die, before one of them sloughs."""
     scene = tf.scenes.biofilm(
         diffusion=1e4, width=40.0, first=4, erosion=[0.005, 0.02], maintenance=0.05
@@ -70,7 +79,7 @@ def losses() -> None:
     assert before is not None
     pictures.show(
         before, scene=scene, colour="growth_rate", background="nutrient", dpi=100,
-        out=PICTURE.with_name("biofilm_losses.png"),
+        out=picture,
         title="erosion 0.005 and 0.02/(µm·h), maintenance 0.05/h",
     )  # fmt: skip
 
@@ -79,31 +88,36 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--hours", type=float, default=20.0)
-    parser.add_argument("--picture", type=Path, default=PICTURE)
-    parser.add_argument("--losses", action="store_true", help="films that die at the floor")
-    parser.add_argument("--rest", action="store_true", help="films that erode, at rest")
+    parser.add_argument("--hours", type=positive, help=f"default: {HOURS:g}")
+    parser.add_argument("--picture", type=out_file, help="default: one of docs/pictures")
+    either = parser.add_mutually_exclusive_group()
+    either.add_argument("--losses", action="store_true", help="films that die at the floor")
+    either.add_argument("--rest", action="store_true", help="films that erode, at rest")
     options = parser.parse_args()
-    if options.rest or options.losses:
-        (at_rest if options.rest else losses)()
-        return
+    if options.hours and (options.losses or options.rest):
+        parser.error("--losses and --rest end by themselves: leave --hours out")
+    if options.picture and options.rest:
+        parser.error("--rest draws no picture: leave --picture out")
+    if options.rest:
+        return at_rest()
+    if options.losses:
+        return losses(options.picture or PICTURES / "biofilm_losses.png")
     each = torch.tensor(DIFFUSION).repeat_interleave(REPLICATES)
     scene = tf.scenes.biofilm(diffusion=each.tolist())
     print(f"diffusion, µm²/h: {', '.join(f'{x:g}' for x in DIFFUSION)}")
     begun, cell_steps = time.perf_counter(), 0
-    for state in tf.simulate(scene, until=options.hours, seed=SEED):
+    for state in tf.simulate(scene, until=options.hours or HOURS, seed=SEED):
         cell_steps += state.cells
-        if state.step % 100 == 0:
-            film = tf.measure.film(state)
-            print(f"{state.time:4.1f} h: thickness {in_words(film.thickness)} µm")
-            print(f"        roughness {in_words(film.roughness)}")
+        if state.step % EVERY == 0:
+            say(state)
+    if state.step % EVERY:
+        say(state)
     seconds = time.perf_counter() - begun
     print(f"{1e6 * seconds / cell_steps:.1f} µs for a cell and step")
     shown = [k * REPLICATES for k in range(len(DIFFUSION))]
-    options.picture.parent.mkdir(parents=True, exist_ok=True)
     pictures.show(
         state, scene=scene, colour="growth_rate", background="nutrient", whole=True,
-        colonies=shown, out=options.picture, dpi=100,
+        colonies=shown, dpi=100, out=options.picture or PICTURES / "biofilm.png",
         title="diffusion " + ", ".join(f"{x:g}" for x in DIFFUSION) + " µm²/h",
     )  # fmt: skip
 

@@ -16,16 +16,16 @@ import argparse
 import json
 import re
 import time
-from collections import deque
-from pathlib import Path
 
 import numpy as np
 import torch
+from arguments import at_least, out_file, out_folder, whole
 
 import torchfilm as tf
 
 STRIP = 4.0  # µm
 FAR = 40.0  # µm
+LEAST = 50  # cells, for a strip with enough of them in every colony
 CONDITIONS = {
     "as published": {},
     "no AiiA": {"d3": 0.0},
@@ -49,8 +49,9 @@ def border(x: np.ndarray, sink: np.ndarray) -> float:
     return float(x[order][np.argmin(wrong)])
 
 
-def band(state: tf.State, place: int) -> dict[str, float]:
-    """Returns the measures of the band of one colony of the batch."""
+def band(state: tf.State, place: int) -> dict[str, float | None]:
+    """Returns the measures of the band of one colony of the batch; None for the contrast, or for
+    CFP, where it has no cells of that kind beyond FAR."""
     cells = state.colony == place
     x, yfp = state.position[cells, 0].numpy(), state.yfp[cells].double().numpy()
     cfp, sink = state.cfp[cells].double().numpy(), (state.cell_type[cells] == 1).numpy()
@@ -76,25 +77,29 @@ def band(state: tf.State, place: int) -> dict[str, float]:
         "middle_um": float(0.5 * (centres[left] + centres[right])),
         "width_um": float(centres[right] - centres[left] + STRIP),
         "peak": float(profile[top]),
-        "contrast": (
-            float(profile[top] / yfp[sink][inside].mean()) if inside.any() else float("nan")
-        ),
-        "cfp_inside": float(cfp[~sink][sources].mean()) if sources.any() else float("nan"),
+        "contrast": float(profile[top] / yfp[sink][inside].mean()) if inside.any() else None,
+        "cfp_inside": float(cfp[~sink][sources].mean()) if sources.any() else None,
     }
+
+
+def shown(values: list[float | None]) -> str:
+    """Returns mean and spread over the colonies that have the measure."""
+    known = [v for v in values if v is not None]
+    return f"{np.mean(known):.4g} ± {np.std(known):.2g}" if known else "none"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--cells", type=int, default=5000, help="in each colony")
-    parser.add_argument("--seeds", type=int, default=8, help="colonies in each condition")
+    parser.add_argument("--cells", type=at_least(LEAST), default=5000, help="in each colony")
+    parser.add_argument("--seeds", type=whole, default=8, help="colonies in each condition")
     parser.add_argument("--only", nargs="*", choices=list(CONDITIONS), default=list(CONDITIONS))
-    parser.add_argument("--out", type=Path, default=Path("boundary_band.json"))
-    parser.add_argument("--record", type=Path, help="folder for results files, one per condition")
+    parser.add_argument("--out", type=out_file, default="boundary_band.json")
+    parser.add_argument(
+        "--record", type=out_folder, help="folder for results files, one per condition"
+    )
     options = parser.parse_args()
-    if options.record:
-        options.record.mkdir(parents=True, exist_ok=True)
     tf.keep_memory()
     found = json.loads(options.out.read_text()) if options.out.exists() else {}
     print(
@@ -114,17 +119,14 @@ def main() -> None:
             )
         )
         start = time.perf_counter()
-        state = deque(
-            tf.simulate(scene, colonies=options.seeds, seed=0, cells=options.cells, record=record),
-            maxlen=1,
-        ).pop()
+        given = {"colonies": options.seeds, "seed": 0, "cells": options.cells}
+        state = tf.simulate(scene, **given, record=record).last()
         bands = [band(state, k) for k in range(options.seeds)]
         row = {key: [b[key] for b in bands] for key in bands[0]}
         found[name] = row | {"seconds": time.perf_counter() - start, "time_h": state.time}
         options.out.write_text(json.dumps(found, indent=1))
-        shown = {k: f"{np.mean(v):.4g} ± {np.std(v):.2g}" for k, v in row.items()}
         columns = [
-            f"{shown[key]:>{size}}"
+            f"{shown(row[key]):>{size}}"
             for key, size in (
                 ("place_um", 14),
                 ("middle_um", 14),
@@ -138,6 +140,12 @@ def main() -> None:
             f" {found[name]['seconds']:8.1f}",
             flush=True,
         )
+        few = row["contrast"].count(None)
+        if few:
+            print(
+                f"  {few} of {options.seeds} colonies have no contrast: they are too small for"
+                f" sinks farther than {FAR:g} µm from the border; give more --cells"
+            )
 
 
 if __name__ == "__main__":

@@ -21,9 +21,9 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
+from arguments import out_stem, positive, whole
 
 import torchfilm as tf
 from design import Objective, Parameter, Search, Stripe, Task
@@ -71,21 +71,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--colonies", type=int, default=2000, help="number to simulate")
+    parser.add_argument("--colonies", type=whole, default=2000, help="number to simulate")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--width", type=float, default=TARGET.width, help="of the stripe, µm")
+    parser.add_argument("--width", type=positive, default=TARGET.width, help="of the stripe, µm")
     parser.add_argument(
-        "--cells", type=int, default=COLONY["cells"], help="of the colonies of the search"
+        "--cells", type=whole, default=COLONY["cells"], help="of the colonies of the search"
     )
-    parser.add_argument("--spacing", type=float, default=4.0, help="of the grid of AHL, µm")
+    parser.add_argument("--spacing", type=positive, default=4.0, help="of the grid of AHL, µm")
     parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("stripe"),
-        help="path of the files to write, without suffix",
+        "--out", type=out_stem, default="stripe", help="path of the files to write, without suffix"
     )
     options = parser.parse_args()
-    options.out.parent.mkdir(parents=True, exist_ok=True)
     tf.keep_memory()
 
     colony = lambda spacing: {**COLONY, "fixed": {**COLONY["fixed"], "spacing": spacing}}

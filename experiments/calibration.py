@@ -1,6 +1,6 @@
 """Simulation-based calibration of `design.infer`: do 90 % regions cover 90 % of hidden truths?
 
-    OMP_NUM_THREADS=1 python experiments/calibration.py          # a few minutes
+    OMP_NUM_THREADS=1 python experiments/calibration.py          # five minutes
     OMP_NUM_THREADS=1 python experiments/calibration.py --simulations 500 --truths 40 --out runs/sbc
 
 The scene and its four parameters are those of fit_colony.py; each truth is one colony of a few to
@@ -17,10 +17,12 @@ import sys
 import time
 from pathlib import Path
 
+from arguments import at_least, out_folder, whole
 from fit_colony import HOURS, PARAMETERS, SEED, TRUTH, colony
 
 import torchfilm as tf
 from design import Observed, Posterior, infer
+from design.inference import LEAST
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 from record import machine
@@ -84,11 +86,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--simulations", type=int, default=SIMULATIONS)
-    parser.add_argument("--truths", type=int, default=TRUTHS)
-    parser.add_argument("--out", type=Path, default=Path("runs/calibration"))
+    parser.add_argument("--simulations", type=at_least(LEAST), default=SIMULATIONS)
+    parser.add_argument("--truths", type=whole, default=TRUTHS)
+    parser.add_argument("--out", type=out_folder, default="runs/calibration")
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
     tf.keep_memory()
     record, _ = calibrate(options.simulations, options.truths, options.out)
     text = json.dumps(record) + "\n"

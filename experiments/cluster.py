@@ -17,6 +17,7 @@ import threading
 
 import numpy as np
 import torch
+from arguments import not_allowed, whole
 from distributed import Client, LocalCluster
 
 from design import Objective, Parameter, Stripe, Task
@@ -27,16 +28,28 @@ def kill(pid: int) -> None:
     os.kill(pid, signal.SIGKILL)
 
 
+def running(text: str) -> str:
+    """The address of a scheduler that answers."""
+    try:
+        Client(text, timeout=5).close()
+    except (OSError, ValueError) as error:
+        allowed = f"the address of a scheduler that runs, such as tcp://host:8786 ({error})"
+        raise not_allowed(text, allowed) from None
+    return text
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--scheduler", help="address of a running scheduler; default: two workers on this machine"
+        "--scheduler",
+        type=running,
+        help="address of a running scheduler; default: two workers on this machine",
     )
-    parser.add_argument("--cells", type=int, default=60)
-    parser.add_argument("--designs", type=int, default=32)
-    parser.add_argument("--work-items", type=int, default=4)
+    parser.add_argument("--cells", type=whole, default=60)
+    parser.add_argument("--designs", type=whole, default=32)
+    parser.add_argument("--work-items", type=whole, default=4)
     options = parser.parse_args()
     parameters, target = (
         [Parameter("k3", 0.1, 10, log=True), Parameter("d3", 1e-3, 1.0, log=True)],

@@ -11,7 +11,8 @@ switch back.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+
+from arguments import out_stem, positive, whole
 
 import torchfilm as tf
 from design import DomainSize, Parameter, Search
@@ -28,12 +29,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--size", type=float, default=12.0, help="target size of the patches, µm")
-    parser.add_argument("--colonies", type=int, default=400, help="number to simulate")
+    parser.add_argument(
+        "--size", type=positive, default=12.0, help="target size of the patches, µm"
+    )
+    parser.add_argument("--colonies", type=whole, default=400, help="number to simulate")
     parser.add_argument(
         "--out",
-        type=Path,
-        default=Path("domain_size"),
+        type=out_stem,
+        default="domain_size",
         help="path of the files to write, without suffix",
     )
     options = parser.parse_args()

@@ -1,9 +1,10 @@
 """Measures the cost of each effect in every ready-made scene: time, operators and bytes per step.
 
     OMP_NUM_THREADS=1 python experiments/effect_costs.py          # five to ten minutes
-    OMP_NUM_THREADS=1 python experiments/effect_costs.py --cells 50 --out costs.json --page ''
+    OMP_NUM_THREADS=1 python experiments/effect_costs.py --cells 50 --out runs/costs.json
 
-The first command writes its part of docs/effects.md and a JSON record.
+The first command writes its part of docs/effects.md and a JSON record, scene by scene. With some
+scenes or other sizes the record goes to runs/, and the page stays as it is.
 
 Each scene grows from its founders to 200 cells in each of 4 colonies, or for 12 h. From there the
 script runs 20 steps twice. One run is timed. The other counts the dispatched operators and the
@@ -21,11 +22,12 @@ import json
 import statistics
 import sys
 import textwrap
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
+from arguments import out_file, whole
 
 import torchfilm as tf
 from torchfilm.cost_estimate import Spending
@@ -34,7 +36,7 @@ sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 from record import machine, scenes_parser, write_page
 
 HERE = Path(__file__).parent
-STEPS, HOURS = 20, 12.0
+CELLS, COLONIES, STEPS, HOURS = 200, 4, 20, 12.0
 # Sizes of the ready-made scenes whose default size holds too few cells.
 SETTINGS = {"channel": {"width": 16.0, "length": 80.0}, "programmed_growth": {"edge": 20.0}}
 MARK = "tables: experiments/effect_costs.py"
@@ -44,8 +46,7 @@ BODY = ("growth", "mechanics", "division")
 def grown(scene: tf.Scene, cells: int, colonies: int) -> tf.State:
     """Returns the colonies of a scene with `cells` cells each, or after HOURS."""
     until = round(HOURS / scene.dt) * scene.dt
-    run = tf.simulate(scene, colonies=colonies, seed=0, cells=cells, until=until)
-    return deque(run, maxlen=1).pop()
+    return tf.simulate(scene, colonies=colonies, seed=0, cells=cells, until=until).last()
 
 
 def counted(model: tf.Model, state: tf.State, steps: int) -> list[Spending]:
@@ -229,28 +230,38 @@ def tables(noted: dict, records: list[dict]) -> str:
 
 def main() -> None:
     parser = scenes_parser(__doc__)
-    parser.add_argument("--cells", type=int, default=200, help="in each colony")
-    parser.add_argument("--colonies", type=int, default=4)
+    parser.add_argument("--cells", type=whole, default=CELLS, help="in each colony")
+    parser.add_argument("--colonies", type=whole, default=COLONIES)
     parser.add_argument(
         "--out",
-        type=Path,
-        default=HERE / "benchmarks" / "effect_costs.json",
-        help="JSON record to write; replaces an existing one",
+        type=out_file,
+        help="JSON record to write; replaces an existing one; default: that of the page, or"
+        " runs/effect_costs.json with some scenes or other sizes",
     )
     parser.add_argument(
         "--page",
-        default=str(HERE.parent / "docs" / "effects.md"),
-        help="page with the tables to update; '' for none",
+        help="page with the tables to update; '' for none; default: docs/effects.md, or none with"
+        " some scenes or other sizes",
     )
     options = parser.parse_args()
+    usual = not options.scene and (options.cells, options.colonies) == (CELLS, COLONIES)
+    if options.page is None:
+        options.page = HERE.parent / "docs" / "effects.md" if usual else ""
+    if options.out is None:
+        name = "effect_costs.json"
+        options.out = HERE / "benchmarks" / name if usual else out_file(f"runs/{name}")
     tf.keep_memory()
     torch.set_grad_enabled(False)
     noted, records = machine(), []
+    write = lambda: options.out.write_text(
+        json.dumps([noted | record for record in records], indent=1) + "\n"
+    )
     for name in options.scene or tf.scenes.READY:
         records.append(of_scene(name, options.cells, options.colonies))
+        write()  # an interrupted run keeps what it has
         print("\n".join(scene_rows(records[-1])), flush=True)
     records += beside(options.cells, options.colonies)
-    options.out.write_text(json.dumps([noted | record for record in records], indent=1) + "\n")
+    write()
     if options.page:
         write_page(Path(options.page), tables(noted, records), MARK)
 

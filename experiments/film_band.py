@@ -9,7 +9,8 @@ The search chooses the two thresholds of a band detector for the nutrient, on wh
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+
+from arguments import out_stem, whole
 
 import torchfilm as tf
 from design import Bands, Parameter, Search
@@ -36,9 +37,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--colonies", type=int, default=200, help="number to simulate")
+    parser.add_argument("--colonies", type=whole, default=200, help="number to simulate")
     parser.add_argument(
-        "--out", type=Path, default=Path("film"), help="path of the files to write, without suffix"
+        "--out", type=out_stem, default="film", help="path of the files to write, without suffix"
     )
     options = parser.parse_args()
     tf.keep_memory()

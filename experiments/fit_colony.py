@@ -20,9 +20,11 @@ import time
 from pathlib import Path
 
 import torch
+from arguments import at_least, out_folder
 
 import torchfilm as tf
 from design import Observed, Parameter, infer
+from design.inference import LEAST
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 from record import machine
@@ -81,10 +83,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--simulations", type=int, default=SIMULATIONS)
-    parser.add_argument("--out", type=Path, default=Path("runs/fit"))
+    parser.add_argument("--simulations", type=at_least(LEAST), default=SIMULATIONS)
+    parser.add_argument("--out", type=out_folder, default="runs/fit")
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
     tf.keep_memory()
     table = options.out / "table.csv"
     cells = write_table(table)

@@ -22,6 +22,7 @@ from collections import Counter
 from dataclasses import replace
 
 import torch
+from arguments import whole
 from fuzz_draws import DRAWS, PUSHING, Beside, Capsules, Contacts, Draw, for_each
 from fuzz_scenes import eats, mechanics, scene_of
 from torch import Tensor
@@ -303,7 +304,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--examples", type=int, default=300)
+    parser.add_argument("--examples", type=whole, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--contacts", action="store_true", help="cells, walls and growth alone")
     chosen = parser.parse_args()

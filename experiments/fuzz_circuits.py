@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from arguments import whole
 from fuzz_draws import OUTSIDE, Outside, for_each
 from fuzz_scenes import medium
 from hypothesis import strategies as st
@@ -110,7 +111,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--examples", type=int, default=1000)
+    parser.add_argument("--examples", type=whole, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
     compiled._module = plain_module

@@ -1,13 +1,14 @@
 """Growth of microcolonies under two length drags, against the same colonies without mechanics.
 
-    OMP_NUM_THREADS=1 python experiments/growth_regimes.py       # a few minutes
-    OMP_NUM_THREADS=1 python experiments/growth_regimes.py --quick --out runs/growth_regimes.json
+    OMP_NUM_THREADS=1 python experiments/growth_regimes.py       # ten seconds
+    OMP_NUM_THREADS=1 python experiments/growth_regimes.py --quick
 
 Six colonies of the scene `microcolony` grow from one cell with a length drag of 1e5 (the default,
 free growth) and of 10 (the paper's, growth limited by pressure), until each has 2,000 cells or
 after 24 h. Without mechanics the same colonies, from the same seed, grow at the rate of their
 cells. The script writes the curves as JSON and draws the picture of docs/growth_regimes.md. With
---quick it stops at 200 cells and leaves the picture of the page as it is.
+--out the picture is beside the JSON, and that of the page stays as it is. With --quick it stops at
+200 cells, and the default of --out is runs/growth_regimes.json.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from arguments import out_file
 from matplotlib import pyplot as plt
 
 import torchfilm as tf
@@ -108,7 +110,6 @@ def draw(courses: dict[str, Course], path: Path) -> None:
         axes.axhline(1.0, color="silver", lw=5.0, zorder=0)
         axes.set(xlabel=what, ylabel="volume / volume without mechanics", ylim=(0, 1.1))
     right.set(xlim=(8, 2 * most))
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -117,9 +118,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--quick", action="store_true", help="200 cells; picture beside the JSON")
-    parser.add_argument("--out", type=Path, default=HERE / "benchmarks" / "growth_regimes.json")
+    parser.add_argument("--quick", action="store_true", help="200 cells")
+    parser.add_argument("--out", type=out_file, help="JSON file; the picture is beside it")
     options = parser.parse_args()
+    name = "growth_regimes.json"
+    out = options.out or (out_file(f"runs/{name}") if options.quick else None)
     tf.keep_memory()
     cells, free_hours = (200, 7.0) if options.quick else (2000, FREE_HOURS)
     courses = {
@@ -133,10 +136,9 @@ def main() -> None:
         print(summary(name, courses[name], courses[FREE]))
     record = {"machine": machine(), "colonies": COLONIES, "seed": SEED}
     record |= {"courses": {name: found.record() for name, found in courses.items()}}
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(record) + "\n")
-    picture = HERE.parent / "docs" / "pictures" / "growth_regimes.png"
-    draw(courses, options.out.with_suffix(".png") if options.quick else picture)
+    (out or HERE / "benchmarks" / name).write_text(json.dumps(record) + "\n")
+    pictures = HERE.parent / "docs" / "pictures"
+    draw(courses, (out or pictures / name).with_suffix(".png"))
 
 
 if __name__ == "__main__":

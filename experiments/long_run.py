@@ -1,6 +1,7 @@
 """Tests memory use and conservation of amounts in a long run of an open channel at steady state.
 
     python experiments/long_run.py --steps 100000 --out runs/long_run.csv
+    python experiments/long_run.py --contacts bilateral --length-drag 10    # as docs/stability.md
 
 Cells grow, divide and leave a channel at its open end. Near the closed end (x < 8 µm) they are in a
 reservoir and take up AHL. Farther on they exchange AHL with the medium on a grid and carry it out
@@ -20,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from arguments import out_file, positive, whole
 
 import torchfilm as tf
 from torchfilm.effect import REMOVAL
@@ -78,13 +80,14 @@ class Carried(tf.Effect):
         return state.with_fields(carried=state.carried.index_add(0, state.colony, amount))
 
 
-def channel() -> tf.Scene:
+def channel(contacts: str, length_drag: float | None) -> tf.Scene:
     """Returns the scene: a channel with a reservoir at its closed end."""
+    walls = [tf.Channel(WIDTH, low_end=0.0)]
     half = WIDTH / 2
     return tf.Scene(
         tf.Growth(rate=tf.Uniform(0.8, 1.2)),
         tf.Division(length=tf.Uniform(3.5, 4.5)),
-        tf.Mechanics(dim=2, walls=[tf.Channel(WIDTH, low_end=0.0)]),
+        tf.Mechanics(walls, dim=2, contacts=contacts, length_drag=length_drag),
         tf.Circuit(lux, species=("luxi", "ahl"), daughters="amount", rtol=0.01),
         tf.Medium(
             ahl=tf.Signal(diffusion=50.0, reservoir=1.0),
@@ -130,19 +133,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--steps", type=int, default=100_000)
+    parser.add_argument("--steps", type=whole, default=100_000)
     parser.add_argument(
-        "--minutes", type=float, default=float("inf"), help="stop after this time at the latest"
+        "--minutes", type=positive, default=float("inf"), help="stop after this time at the latest"
     )
+    parser.add_argument("--contacts", choices=("one-sided", "bilateral"), default="one-sided")
+    parser.add_argument("--length-drag", type=positive, help="default: that of the contacts")
     parser.add_argument("--dtype", choices=("float32", "float64"), default="float32")
-    parser.add_argument("--out", type=Path, default=Path("runs/long_run.csv"))
+    parser.add_argument("--out", type=out_file, default="runs/long_run.csv")
     options = parser.parse_args()
     torch.set_num_threads(1)
     tf.keep_memory()
-    scene, begin, rows = channel(), time.perf_counter(), []
+    scene, begin, rows = channel(options.contacts, options.length_drag), time.perf_counter(), []
     dtype = getattr(torch, options.dtype)
     every = max(1, min(500, options.steps // 100))
-    options.out.parent.mkdir(parents=True, exist_ok=True)
     with options.out.open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(COLUMNS)

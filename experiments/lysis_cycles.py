@@ -14,6 +14,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from arguments import out_file, positive
 from matplotlib import pyplot as plt
 
 import torchfilm as tf
@@ -21,6 +22,7 @@ import torchfilm as tf
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "lysis.png"
 COLONIES, SEED = 8, 0
 APART = 1.5  # hours between two bursts, at least
+SETTLED = 6.0  # hours after which the cycles are as later ones
 
 
 def peaks(hours: np.ndarray, cells: np.ndarray) -> np.ndarray:
@@ -29,8 +31,9 @@ def peaks(hours: np.ndarray, cells: np.ndarray) -> np.ndarray:
     near = [np.abs(hours - t) <= APART for t in hours]
     whole = (hours >= APART) & (hours <= hours[-1] - APART)
     tops = [k for k in np.flatnonzero(whole) if cells[k] == cells[near[k]].max()]
-    # where the number stays a while, its first time
-    return np.array([hours[k] for i, k in enumerate(tops) if i == 0 or k - tops[i - 1] > 1])
+    # of equal numbers within APART the first: one burst
+    apart = np.diff(hours[tops], prepend=-np.inf) > APART
+    return hours[tops][apart]
 
 
 def draw(hours: np.ndarray, rows: dict[str, np.ndarray], path: Path) -> None:
@@ -41,7 +44,6 @@ def draw(hours: np.ndarray, rows: dict[str, np.ndarray], path: Path) -> None:
         axes.plot(hours, values[:, 0], color="tab:blue", lw=1.5)
         axes.set(ylabel=name, xlim=(0, hours[-1]), ylim=(0, None))
     panels[-1].set_xlabel("time, h")
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -50,8 +52,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--hours", type=float, default=24.0)
-    parser.add_argument("--picture", type=Path, default=PICTURE)
+    parser.add_argument("--hours", type=positive, default=24.0)
+    parser.add_argument("--picture", type=out_file, default=PICTURE)
     options = parser.parse_args()
     scene, names = tf.scenes.synchronized_lysis(), ("cells", "AHL, conc", "cargo outside, conc")
     found = []
@@ -64,10 +66,15 @@ def main() -> None:
     for b in range(COLONIES):
         tops = peaks(hours, rows["cells"][:, b])
         between += np.diff(tops).tolist()
-        print(f"colony {b}: most cells at {', '.join(f'{t:.1f}' for t in tops)} h")
-    print(f"between bursts: {np.mean(between):.2f} ± {np.std(between):.2f} h")
-    last = rows["cells"][hours > 6.0]
-    print(f"cells after 6 h: {last.min()} to {last.max()}")
+        when = ", ".join(f"{t:.1f}" for t in tops)
+        print(f"colony {b}: " + (f"most cells at {when} h" if when else "no burst yet"))
+    if between:
+        print(f"between bursts: {np.mean(between):.2f} ± {np.std(between):.2f} h")
+    else:
+        print("between bursts: no colony has burst twice; give more --hours")
+    last = rows["cells"][hours > SETTLED]
+    if len(last):
+        print(f"cells after {SETTLED:g} h: {last.min()} to {last.max()}")
     draw(hours, rows, options.picture)
 
 

@@ -1,6 +1,7 @@
 """How exact cells from label images are: capsules of known size, in pixels and back.
 
     OMP_NUM_THREADS=1 python experiments/micrograph_fit.py
+    OMP_NUM_THREADS=1 python experiments/micrograph_fit.py --count 20 --picture runs/fit.png
 
 Prints the table of docs/micrographs.md: root mean square errors by the radius in pixels, of
 `Cells.from_masks` and of taking the axes of the ellipse with the same moments as length and width.
@@ -16,6 +17,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+from arguments import out_file, whole
 from scipy.ndimage import gaussian_filter
 from skimage.measure import regionprops_table
 
@@ -72,8 +74,9 @@ def table(count: int) -> None:
     print("|---|---|---|---|---|---|---|")
     for low, high in RADII:
         with warnings.catch_warnings():
-            # tiny capsules are far from smooth
+            # tiny capsules are far from smooth; sizes are in pixels, not in µm
             warnings.filterwarnings("ignore", message=".*not shaped like a straight capsule")
+            warnings.filterwarnings("ignore", message=".*µm wide \\(median\\)")
             rms = np.sqrt((errors(low, high, count, rng) ** 2).mean(0))
         place, angle, *sizes = rms
         print(
@@ -83,7 +86,7 @@ def table(count: int) -> None:
         )
 
 
-def picture() -> None:
+def picture(path: Path) -> None:
     state = tf.simulate(tf.scenes.microcolony(), cells=60).last()
     position = state.position.numpy() / PIXEL
     x, y = (position - position.min(0) + 32).T
@@ -104,12 +107,20 @@ def picture() -> None:
         "label": np.arange(1, len(x) + 1),
     }
     cells = tf.Cells.from_table(columns, pixel_size=PIXEL, y="down", radius=0.5)
-    tf.pictures.overlay(cells, phase, PICTURE, depth=0.05, dpi=130)
+    tf.pictures.overlay(cells, phase, path, depth=0.05, dpi=130)
     print(cells.relaxed().summary())
 
 
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--count", type=whole, default=400, help="capsules for each row")
+    parser.add_argument("--picture", type=out_file, default=PICTURE)
+    options = parser.parse_args()
+    table(options.count)
+    picture(options.picture)
+
+
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=400, help="capsules for each row")
-    table(parser.parse_args().count)
-    picture()
+    main()

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from arguments import checked, in_file, out_stem, whole
 from scipy.optimize import least_squares
 from torch import Tensor
 
@@ -231,6 +232,14 @@ def say(name: str, states: list[tf.State]) -> str:
     )
 
 
+@checked
+def weights_file(text: str) -> Path:
+    """A file of weights of the controller."""
+    path = in_file(text)
+    load_weights(Controller(), path)
+    return path
+
+
 def draw(rows: dict[str, list[tf.State]], path: Path) -> None:
     """One new colony at three times, of each answer; dashed: where the band should be."""
     from matplotlib.figure import Figure
@@ -263,11 +272,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--steps", type=int, default=100, help="steps of Adam")
-    parser.add_argument("--colonies", type=int, default=600, help="that the search may grow")
-    parser.add_argument("--weights", type=Path, help="take these weights and train no further")
+    parser.add_argument("--steps", type=whole, default=100, help="steps of Adam")
+    parser.add_argument("--colonies", type=whole, default=600, help="that the search may grow")
     parser.add_argument(
-        "--out", type=Path, default=Path("neural"), help="path of the files to write, no suffix"
+        "--weights", type=weights_file, help="take these weights and train no further"
+    )
+    parser.add_argument(
+        "--out", type=out_stem, default="neural", help="path of the files to write, no suffix"
     )
     options = parser.parse_args()
     tf.keep_memory()

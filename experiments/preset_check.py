@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import math
 import sys
 from pathlib import Path
 
@@ -61,6 +62,17 @@ def resolved(probe: AccuracyProbe, search: SettingsSearch) -> tuple[Seen, list[s
         coarser, finest = reference, 2 * finest
 
 
+def reason(probe: AccuracyProbe, settings: tf.Settings) -> str:
+    """Returns why the first colony fails in the window with these settings."""
+    state = probe.start
+    model, dt = settings.apply(probe.scene).bind(state=state), settings.dt
+    for _ in range(probe.steps(settings)):
+        state = model.step(state, dt)
+        if failed := tf.failures(state):
+            return failed[0].reason
+    return "no colony fails in a run of its own"
+
+
 def check(name: str) -> list[dict[str, str]]:
     """Returns a row for each preset of one scene."""
     scene = tf.scenes.build(name)
@@ -77,6 +89,8 @@ def check(name: str) -> list[dict[str, str]]:
         errors = probe.errors(runs[0].found, reference)
         others = {n: e for n, e in errors.items() if n not in SHOWN}
         worst = max(others, key=lambda n: others[n].value)
+        if math.isinf(others[worst].value):
+            print(f"{name}, {kind} fails: {reason(probe, settings)}", flush=True)
         rows.append({
             "scene": name,
             "preset": kind,

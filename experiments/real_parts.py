@@ -13,10 +13,10 @@ from __future__ import annotations
 import argparse
 import functools
 import json
-from pathlib import Path
 from typing import Any
 
 import torch
+from arguments import out_stem, whole
 
 import torchfilm as tf
 from design import CMAES, Image, Library, Search, Sensor, Wiring
@@ -157,11 +157,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--colonies", type=int, default=1000, help="number to simulate")
+    parser.add_argument("--colonies", type=whole, default=1000, help="number to simulate")
     parser.add_argument(
         "--out",
-        type=Path,
-        default=Path("real_parts"),
+        type=out_stem,
+        default="real_parts",
         help="path of the files to write, without suffix",
     )
     options = parser.parse_args()

@@ -10,7 +10,8 @@ signal, a "shallow" one two.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+
+from arguments import out_stem, whole
 
 import torchfilm as tf
 from design import CMAES, Choice, Parameter, Ring, Search
@@ -78,9 +79,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--colonies", type=int, default=1000, help="number to simulate")
+    parser.add_argument("--colonies", type=whole, default=1000, help="number to simulate")
     parser.add_argument(
-        "--out", type=Path, default=Path("ring"), help="path of the files to write, without suffix"
+        "--out", type=out_stem, default="ring", help="path of the files to write, without suffix"
     )
     options = parser.parse_args()
     tf.keep_memory()

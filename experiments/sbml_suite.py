@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from arguments import in_folder, out_file, positive, whole
 
 import torchfilm as tf
 from torchfilm.circuits import sbml
@@ -193,16 +194,20 @@ def table(found: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("path", type=Path, help="the folder of the cases, cases/semantic")
-    parser.add_argument("--out", type=Path, help="where to write the table, and beside it a .json")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("path", type=in_folder, help="the folder of the cases, cases/semantic")
+    parser.add_argument(
+        "--out", type=out_file, help="where to write the table, and beside it a .json"
+    )
     parser.add_argument("--only", nargs="*", default=(), help="numbers of cases")
-    parser.add_argument("--every", type=int, default=1, help="only every so many cases")
+    parser.add_argument("--every", type=whole, default=1, help="only every so many cases")
     parser.add_argument("--backend", default="torch", choices=("torch", "compiled"))
-    parser.add_argument("--rtol", type=float, default=1e-6)
-    parser.add_argument("--atol", type=float, default=1e-11)
-    parser.add_argument("--seconds", type=int, default=120, help="at most, for one case")
-    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--rtol", type=positive, default=1e-6)
+    parser.add_argument("--atol", type=positive, default=1e-11)
+    parser.add_argument("--seconds", type=whole, default=120, help="at most, for one case")
+    parser.add_argument("--processes", type=whole, default=2)
     options = parser.parse_args()
     cases = sorted(p for p in options.path.iterdir() if (p / f"{p.name}-settings.txt").is_file())
     cases = [c for c in cases if not options.only or c.name in options.only][:: options.every]
@@ -214,7 +219,6 @@ def main() -> None:
             print(record["case"], record["why"])
     print(table(found))
     if options.out is not None:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
         options.out.write_text(table(found))
         options.out.with_suffix(".json").write_text(json.dumps(found, indent=0))
 

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+from arguments import in_file, out_file
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
@@ -199,8 +200,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--values", type=Path, help="JSON file for the values")
-    parser.add_argument("--with", dest="extra", type=Path, help="add the values of another run")
+    parser.add_argument("--values", type=out_file, help="JSON file for the values")
+    parser.add_argument("--with", dest="extra", type=in_file, help="add the values of another run")
     options = parser.parse_args()
     collector, ships = run(), run(ships=True)
     for case, rows in ships.values.items():

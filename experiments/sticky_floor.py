@@ -14,6 +14,7 @@ import argparse
 from pathlib import Path
 
 import torch
+from arguments import out_file
 
 import torchfilm as tf
 from torchfilm import pictures
@@ -49,7 +50,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--picture", type=Path, default=PICTURE)
+    parser.add_argument("--picture", type=out_file, default=PICTURE)
     options = parser.parse_args()
     each = torch.tensor(STRENGTHS).repeat_interleave(REPLICATES).tolist()
     scene = scene_of(each)
@@ -61,7 +62,6 @@ def main() -> None:
             print(f"{size:5d}, {strength:3g}: {share:.2f}, {height:4.1f}, {radius:4.1f}")
         if size == DRAWN:
             shown = [k * REPLICATES for k in range(len(STRENGTHS))]
-            options.picture.parent.mkdir(parents=True, exist_ok=True)
             pictures.show(
                 state, scene=scene, view="xz", colonies=shown, out=options.picture, dpi=110,
                 title="strengths " + ", ".join(f"{x:g}" for x in STRENGTHS) + " μ·µm²/h",

@@ -35,6 +35,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from arguments import checked, in_file, not_allowed, out_file
 
 import torchfilm as tf
 from torchfilm.cli.inspect import parse_error
@@ -219,34 +220,38 @@ def check(name: str, error: float) -> dict[str, str]:
     return dict(zip(COLUMNS, row, strict=True))
 
 
+@checked
+def share(text: str) -> str:
+    """The text of an error to request."""
+    if not parse_error(text) > 0:
+        raise not_allowed(text, "a share above 0, such as 1% or 0.01")
+    return text
+
+
 def main() -> None:
     parser = scenes_parser(__doc__)
-    parser.add_argument("--error", default="1%", help="error to request")
+    parser.add_argument("--error", type=share, default="1%", help="error to request")
     parser.add_argument(
-        "--out", type=Path, help="CSV file; default: that of the records, or none with --scene"
+        "--out", type=out_file, help="CSV file; default: that of the records, or none with --scene"
     )
     parser.add_argument(
         "--gather",
         nargs="+",
-        type=Path,
+        type=in_file,
         default=[],
         help="CSV files of scenes that were checked separately",
     )
     options = parser.parse_args()
     tf.keep_memory()
     torch.set_grad_enabled(False)
-    rows, error = (
-        [row for path in options.gather for row in csv.DictReader(path.open(newline=""))],
-        parse_error(options.error),
-    )
+    rows = [row for path in options.gather for row in csv.DictReader(path.open(newline=""))]
     for name in () if rows else options.scene or tf.scenes.READY:
-        rows.append(check(name, error))
+        rows.append(check(name, parse_error(options.error)))
         print(rows[-1], flush=True)
     out, write_page = options.out, not options.scene and options.out is None
     if write_page:
         out = appendix.RECORDS / "tune.csv"
     if out:
-        out.parent.mkdir(parents=True, exist_ok=True)
         with out.open("w", newline="") as file:
             table = csv.DictWriter(file, COLUMNS)
             table.writeheader()

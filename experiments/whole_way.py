@@ -21,15 +21,18 @@ pip install -e ".[app,design,images,tables,sbml]".
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 
 import torch
+from arguments import at_least, out_folder, positive
 from matplotlib.figure import Figure
 
 import torchfilm as tf
 from design import Bands, Best, Observed, Parameter, Search
 
 PIXEL, FRAME_HOURS = 0.065, 0.5  # µm a pixel, and h between frames
+STEP = 0.05  # h
 HIDDEN = {"rate": 1.15, "division": 3.4}  # 1/h and µm, to be found by the fit
 STRIPE = (-4.0, 4.0)  # µm along x: where cells should be lit
 SIDE, REACH = 40.0, 10.0  # µm: half the box; over which the morphogen falls to 1/e
@@ -56,7 +59,7 @@ def colony(masks=None, frame=0, pixel_size=PIXEL, rate=1.0, division=4.0) -> tf.
         tf.Division(length=tf.LogNormal(division, 0.1)),  # µm
         tf.Mechanics(dim=2),
         founders=founders,
-        dt=0.05,
+        dt=STEP,
     )
 
 
@@ -174,23 +177,32 @@ def chosen() -> argparse.Namespace:
         default=argparse.SUPPRESS,
         help="your label images, a stack (default: made here)",
     )
-    parser.add_argument("--pixel-size", type=float, default=PIXEL, help="µm a pixel")
-    parser.add_argument("--frame-hours", type=float, default=FRAME_HOURS, help="h between frames")
+    parser.add_argument("--pixel-size", type=positive, default=PIXEL, help="µm a pixel")
+    parser.add_argument(
+        "--frame-hours", type=positive, default=FRAME_HOURS, help="h between frames"
+    )
     parser.add_argument("--frames", type=int, nargs=2, default=(5, 9), help="of the fit, from 0")
     parser.add_argument(
-        "--colonies", type=int, default=480, help="of the fit; half as many of the design"
+        "--colonies", type=at_least(2), default=480, help="of the fit; half as many of the design"
     )
-    parser.add_argument("--out", type=Path, default=Path("runs/whole_way"), help="folder of files")
+    parser.add_argument("--out", type=out_folder, default="runs/whole_way", help="folder of files")
     options = parser.parse_args(namespace=argparse.Namespace(masks=None))
     if not 0 <= options.frames[0] < options.frames[1]:
         parser.error("--frames: give the earlier frame first, both counted from 0.")
+    # of masks that are made here, each frame is at the end of a step
+    frames = 1 if options.masks is None else options.frames[1] - options.frames[0]
+    steps = frames * options.frame_hours / STEP
+    if round(steps) < 1 or not math.isclose(steps, round(steps), rel_tol=1e-6):
+        parser.error(
+            f"--frame-hours: {frames} × {options.frame_hours:g} h is no whole number of steps of"
+            f" {STEP:g} h. Give such as {max(1, round(steps)) * STEP / frames:.6g}."
+        )
     return options
 
 
 def main() -> None:
     options = chosen()
     out, (first, last) = options.out, options.frames
-    out.mkdir(parents=True, exist_ok=True)
     tf.keep_memory()
     masks = options.masks or out / "masks.tif"
     if options.masks is None:

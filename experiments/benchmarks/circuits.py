@@ -34,6 +34,7 @@ from torchfilm.tools.timing import Timings
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import boundary_stripe
+from arguments import out_file, whole
 
 DT = 0.05
 BACKENDS = ("compiled", "torch")
@@ -181,7 +182,7 @@ def row(record: dict) -> str:
     step, solver = record["step_ms"], record["solver_ms"]
     return (
         f"{record['method']:<12}{record['cells']:>7}{record['events']:>10}"
-        f"{step['torch']:>11.1f}{step['compiled']:>10.1f}{record['step_ratio']:>7.1f}"
+        f"{step['torch']:>13.1f}{step['compiled']:>10.1f}{record['step_ratio']:>7.1f}"
         f"{solver['torch']:>11.1f}{solver['compiled']:>10.1f}{record['solver_ratio']:>7.1f}"
         f"  {'same bits' if record['same_bits'] else 'other bits'}"
     )
@@ -196,10 +197,10 @@ def main() -> None:
     )
     parser.add_argument("--explicit", action="store_true")
     parser.add_argument("--exchange", action="store_true")
-    parser.add_argument("--colonies", type=int, default=64)
-    parser.add_argument("--cells", type=int, default=100, help="cells a colony, in the mean")
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_name("circuits.json"))
+    parser.add_argument("--colonies", type=whole, default=64)
+    parser.add_argument("--cells", type=whole, default=100, help="cells a colony, in the mean")
+    parser.add_argument("--repeats", type=whole, default=5)
+    parser.add_argument("--out", type=out_file, default=Path(__file__).with_name("circuits.json"))
     options = parser.parse_args()
     tf.keep_memory()
     if options.exchange:
@@ -210,7 +211,7 @@ def main() -> None:
             print_explicit(name, options)
         return
     print(
-        f"{'method':<12}{'cells':>7}{'steps':>10}{'step: torch':>11}{'compiled':>10}{'ratio':>7}"
+        f"{'method':<12}{'cells':>7}{'steps':>10}{'step: torch':>13}{'compiled':>10}{'ratio':>7}"
         f"{'solver':>11}{'compiled':>10}{'ratio':>7}   ms, {torch.get_num_threads()} threads"
     )
     records = json.loads(options.out.read_text()) if options.out.exists() else []

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,9 @@ import torch
 from record import machine
 
 import torchfilm as tf
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from arguments import out_file, own_device
 
 STEPS = 6
 # by name: the ready-made scene, None for free growth; colonies; cells of each
@@ -112,9 +116,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--case", nargs="*", choices=list(CASES), default=list(CASES))
-    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--device", type=own_device, default="cuda")
     parser.add_argument("--derivatives", action="store_true")
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
+    parser.add_argument("--out", type=out_file, default=Path(__file__).with_suffix(".json"))
     options = parser.parse_args()
     records = json.loads(options.out.read_text()) if options.out.exists() else []
     if options.derivatives:

@@ -1,7 +1,7 @@
 """Measures the time of growth, and how clean contacts stay: colonies from one cell to N cells each.
 
     python experiments/benchmarks/growth.py                     # the usual set, some minutes
-    python experiments/benchmarks/growth.py --quick             # small sizes
+    python experiments/benchmarks/growth.py --quick --out runs/growth.json    # small sizes
     python experiments/benchmarks/growth.py --case 2d-32000 --regime free --threads 2
     python experiments/benchmarks/growth.py --case 2d-1000000 --regime pressed --limit 3600
     python experiments/benchmarks/growth.py --case 2d-3000 --backend torch --device cuda
@@ -21,6 +21,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
+import textwrap
 import time
 from pathlib import Path
 
@@ -29,6 +31,9 @@ import torch
 from record import machine, write_page
 
 import torchfilm as tf
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from arguments import out_file, own_device, positive, whole
 
 CASES = {
     "2d-1000": (2, 1, 1000), "2d-3000": (2, 1, 3000), "2d-10000": (2, 1, 10000),
@@ -261,14 +266,16 @@ def main() -> None:
     )
     parser.add_argument("--backend", choices=("compiled", "torch"))
     parser.add_argument("--quick", action="store_true", help="small sizes only")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--device", type=own_device, default="cpu")
+    parser.add_argument("--threads", type=whole, default=1)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--limit", type=float, default=np.inf, help="of a run, s of processor time")
+    parser.add_argument(
+        "--limit", type=positive, default=np.inf, help="of a run, s of processor time"
+    )
     parser.add_argument(
         "--page", action="store_true", help="write docs/performance.md, run nothing"
     )
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_name("growth.json"))
+    parser.add_argument("--out", type=out_file, default=Path(__file__).with_name("growth.json"))
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     tf.keep_memory()
@@ -276,9 +283,10 @@ def main() -> None:
     if options.page:
         page = Path(__file__).parents[2] / "docs" / "performance.md"
         write_page(page, table(records), "experiments/benchmarks/growth.py --page")
-        law = picture(records, page.parent / "pictures" / "performance.png")
+        drawn = picture(records, page.parent / "pictures" / "performance.png")
         image = "![Cost of a cell and step against the number of cells](pictures/performance.png)"
-        write_page(page, f"{image}\n\nOne step of N cells, {law}.", "cost against size")
+        law = textwrap.fill(f"One step of N cells, {drawn}.", 100)
+        write_page(page, f"{image}\n\n{law}", "cost against size")
         return
     if options.device == "cpu" and options.backend != "torch":
         records.append(machine() | {"case": "product with JᵀJ"} | product_over_copy())

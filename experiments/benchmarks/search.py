@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from pathlib import Path
 
@@ -40,6 +41,9 @@ import torchfilm as tf
 from design import CMAES, Bayesian, GaussNewton, Local, Objective, Racing, Search, Sobol, Task
 from design.methods.base import sobol_points
 from design.trivial import trivial_losses
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from arguments import out_file, whole
 
 # Batches of 24, because a large batch costs less per colony; a wide initial distribution, because
 # the losses have several minima.
@@ -212,16 +216,15 @@ def main() -> None:
         "--methods", nargs="*", choices=list(METHODS), default=["auto", "sobol", "cmaes"]
     )
     parser.add_argument("--fit", choices=list(FITS), default="four", help="of data")
-    parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--first", type=int, default=1, help="of the seeds")
-    parser.add_argument("--colonies", type=int, default=2000)
+    parser.add_argument("--seeds", type=whole, default=10)
+    parser.add_argument("--first", type=whole, default=1, help="of the seeds")
+    parser.add_argument("--colonies", type=whole, default=2000)
     parser.add_argument("--stop", action="store_true", help="at the threshold, on fresh seeds")
-    parser.add_argument("--cells", type=int, nargs="*", default=[100, 500])
-    parser.add_argument("--designs", type=int, default=64)
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
+    parser.add_argument("--cells", type=whole, nargs="*", default=[100, 500])
+    parser.add_argument("--designs", type=whole, default=64)
+    parser.add_argument("--threads", type=whole, default=2)
+    parser.add_argument("--out", type=out_file, default=Path(__file__).with_suffix(".json"))
     options = parser.parse_args()
-    options.out.parent.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(options.threads)
     tf.keep_memory()
     found = {"tasks": tasks, "ranks": ranks, "data": data, "rate": rate}[options.part](options)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
+import sys
 import time
 from collections import deque
 from pathlib import Path
@@ -30,6 +31,9 @@ from torchfilm.signals.grid import Grid
 from torchfilm.signals.transport import COMPILED, METHODS, Carrier, carry, prepare
 from torchfilm.signals.transport_operator import Operator, apply
 from torchfilm.signals.transport_rates import build_operator
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from arguments import out_file, own_device, positive, whole
 
 SIZES = (32, 64, 128)
 CASES = (*METHODS, "implicit, mask", "apply")
@@ -205,7 +209,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--size", action="append", type=int, help="voxels along an edge; may be repeated"
+        "--size", action="append", type=whole, help="voxels along an edge; may be repeated"
     )
     parser.add_argument(
         "--method", action="append", choices=CASES, help="one method; may be repeated"
@@ -214,10 +218,10 @@ def main() -> None:
     parser.add_argument(
         "--part", action="append", choices=sorted(PARTS), help="one part; may be repeated"
     )
-    parser.add_argument("--cells", type=int, default=5000, help="size of the colony of Fig. 5")
-    parser.add_argument("--seconds", type=float, default=2.0, help="time to repeat each case")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_name("signals.json"))
+    parser.add_argument("--cells", type=whole, default=5000, help="size of the colony of Fig. 5")
+    parser.add_argument("--seconds", type=positive, default=2.0, help="time to repeat each case")
+    parser.add_argument("--device", type=own_device, default="cpu")
+    parser.add_argument("--out", type=out_file, default=Path(__file__).with_name("signals.json"))
     options = parser.parse_args()
     tf.keep_memory()
     records = json.loads(options.out.read_text()) if options.out.exists() else []
