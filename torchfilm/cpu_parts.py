@@ -350,7 +350,8 @@ def _members(part: Part) -> list[BoundEffect]:
 
 
 def _exchanges(effect: BoundEffect) -> bool:
-    return isinstance(effect.effect, Medium) or effect.moves_signals or bool(effect.exchanges())
+    own = isinstance(effect.effect, Medium | MediumReactions)
+    return own or effect.moves_signals or bool(effect.exchanges())
 
 
 def _is_ours(kind: type) -> bool:

@@ -173,3 +173,31 @@ def test_recorded_growth_has_the_same_bits(circuit):
         here, there = model.step(here), replay.step(there)
     assert torch.equal(here.signals["a"], there.signals["a"])
     assert torch.equal(here.signals["b"], there.signals["b"])
+
+
+@pytest.mark.parametrize("options", [{}, {"splitting": "lie"}])
+def test_where_nutrition_moves_what_reacts_reactions_take_whole_steps(options):
+    """Beside circuits, or after the cells, it would have most of the reactions on one side."""
+
+    def run(steps):
+        exchange = [] if options else [tf.Circuit(quiet, species="maker")]
+        scene = tf.Scene(
+            tf.Growth(), *exchange, tf.Monod("food", rate=1.0, half=0.1, growth_yield=1.0),
+            tf.MediumReactions([tf.Reaction.of("food -> b", rate=9.0)]),
+            tf.Medium(food=tf.Signal(50.0, initial=1.0), b=tf.Signal(5.0), **BOX, **options,
+                      steps=steps),
+            founders=FOUR, dim=2, dt=0.1,
+        )  # fmt: skip
+        said = " ".join(str(tf.explain(scene)).split())
+        assert "food: others move or find it once a step, whatever Medium.steps" in said
+        assert "half of the step before transport" in said and "or less: Medium" not in said
+        return later(scene, 1.0)
+
+    whole, divided = run(1), run(4)
+    exact = 1e-3 * float(whole.volume.sum())
+    assert float((whole.volume - divided.volume).abs().max()) < exact
+
+
+def test_explain_asks_for_no_step_more_than_rounding():
+    said = " ".join(str(tf.explain(pattern(20, first=1e-9))).split())
+    assert "or less: Medium(steps" not in said

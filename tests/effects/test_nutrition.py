@@ -468,3 +468,25 @@ def test_it_begins_with_the_rates_of_the_first_concentrations():
     gross = [0.5 * 1.2 * s / (0.4 + s) for s in (0.05, 2.0)]
     assert state.growth_rate.tolist() == pytest.approx([0.0, gross[1] - 0.1])
     assert state.starvation.tolist() == pytest.approx([0.1 - gross[0], 0.0])
+
+
+def test_it_begins_on_a_grid_that_has_grown_to_the_founders():
+    far = tf.Cells([[0.0, 0.0], [40.0, 30.0]], [[1.0, 0.0]] * 2, length=2.0)
+    rising = lambda x: 1.0 + 0.05 * x[:, 0].clamp(min=0.0)
+    scene = eating(tf.Monod("food", rate=1.0, half=0.5), initial=rising, cells=far, outside="grow")
+    state = scene.bind(1, dtype=F64).start()
+    found = state.contact(("food",)).found["food"]
+    assert torch.allclose(state.growth_rate, found / (0.5 + found), rtol=1e-6)
+    assert float(found[1]) > 2.5
+
+
+def test_cells_come_to_a_scene_and_a_scene_takes_over():
+    """Added cells have the rate of what they find."""
+    scene = eating(tf.Monod("food", rate=1.0, half=0.5))
+    model = scene.bind(1)
+    state = model.step(model.start())
+    more = model.add(state, tf.Cells([[5.0, 5.0]], [[1.0, 0.0]], length=2.0))
+    assert float(more.growth_rate[1]) == pytest.approx(1.0 / 1.5, rel=1e-3)
+    other = tf.Scene(tf.Growth(rate=1.0), dim=2, founders=tf.Cells.single(2))
+    taken = scene.take_over(tf.simulate(other, until=0.1).last())
+    assert float(model.step(taken).growth_rate[0]) == pytest.approx(1.0 / 1.5, rel=1e-2)

@@ -141,17 +141,24 @@ class BoundMedium(MediumPart):
         """Let reactions and transport take turns in the medium's steps. with_cells: whether
         circuits do, too, with those signals that are free to."""
         transport, steps = self.transport, self.effect.steps
-        names = {n for e in reactions for n in e.species} - transport.coupled.keys()
         self.sub_steps = transport.apart = None
-        if steps == 1 or not reactions or not (names or with_cells):
+        names = {n for e in reactions for n in e.species}
+        eaten = {n for n in names if transport.coupled.get(n) == "nutrition"}
+        moved = names - transport.coupled.keys()
+        # what acts on these once in a step would have most of the reactions on one side
+        once = sorted(eaten | (moved.difference(free) if with_cells else set()))
+        lopsided = once and (with_cells or not self.effect.halves)
+        for effect in reactions:
+            effect.sub_steps, effect.once = 1, tuple(once)
+        if steps == 1 or not reactions or lopsided or not (moved or with_cells):
             return
         for effect in reactions:
             effect.sub_steps = steps
         if with_cells:
-            transport.in_turns |= names.intersection(free)
+            transport.in_turns |= moved
             self.sub_steps = SubSteps(reactions[0], transport, transport.in_turns)
         else:
-            transport.apart = SubSteps(reactions[0], transport, frozenset(names))
+            transport.apart = SubSteps(reactions[0], transport, frozenset(moved))
 
     def step(self, state: State, dt: float) -> State:
         """Transport to the end of the step."""

@@ -102,6 +102,7 @@ class GridCoverage(MediumPart):
         self.flat = torch.tensor(flat, device=binding.batch.device)
         self.fixed = torch.tensor(fixed_faces(effect.grows), device=binding.batch.device)
         self._seen: ref[Grid] | None = None  # the grid that was checked last
+        transport.covered = self.ready
 
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         """Warn where the box would grow through a wall, or into a medium that is not known."""

@@ -31,6 +31,7 @@ from torchfilm.values import COLONY, Rule, checked_constants
 
 CONSTANT = Rule(scope=COLONY, scheduled=True)
 TRIED = 16  # voxels, of a trial
+ONCE = "others move or find it once a step, whatever Medium.steps"
 SMALL = 0.1  # see `numerics`: changes by reactions in a sub-step that keep what transport balances
 
 # Rates of signals, conc/h by name, from their concentrations s and constants p.
@@ -147,7 +148,8 @@ class BoundReactions(BoundEffect):
     effect: MediumReactions
     first: BoundReactions | None = None  # the other half, which was traced before
     acts_without_cells = False  # whether the medium changes from the start
-    sub_steps = 1  # of each step, in which reactions and transport take turns
+    # of each step, in which reactions and transport take turns; and signals that do not
+    sub_steps, once = 1, ()
 
     def __init__(self, effect: MediumReactions, binding: Binding):
         super().__init__(effect, binding)
@@ -346,13 +348,15 @@ class BoundReactions(BoundEffect):
             return [f"over {half:g} h, by the method that the second half lists"]
         e, rate, sub_steps = self.effect, self._fastest(state), self.sub_steps
         changed = rate * dt / sub_steps
-        enough = math.ceil(sub_steps * changed / SMALL) if changed < math.inf else 1
-        hint = f": Medium(steps={enough})" if enough > sub_steps else ""
+        # rounding of differences asks for no step more
+        enough = math.ceil(0.999 * sub_steps * changed / SMALL) if changed < math.inf else 1
+        hint = f": Medium(steps={enough})" if enough > sub_steps and not self.once else ""
         what, over = ("sub-step", dt / sub_steps) if sub_steps > 1 else ("step", dt)
         return [
             f"{sub_steps} sub-steps of {over:g} h, in turns with transport, timed with it (Strang)"
             if sub_steps > 1
             else "half of the step before transport and exchange, half after (Strang)",
+            *([f"{', '.join(self.once)}: {ONCE}"] if self.once else []),
             f"fastest rate at these concentrations {rate:.2g}/h, {changed:.2g} in a {what}: what"
             f" transport balances, as in patterns and profiles, needs {SMALL:g} or less{hint}",
             f"stiff solver (Rodas3), each voxel in steps of its own: error at most {e.atol:g} +"

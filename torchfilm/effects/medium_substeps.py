@@ -22,9 +22,11 @@ REACT, CARRY = "react", "carry"
 
 @runtime_checkable
 class Reacting(Protocol):
-    """Bound reactions in the medium. sub_steps: of each step, of which `step` does half of one."""
+    """Bound reactions in the medium. sub_steps: of each step, of which `step` does half of one.
+    once: signals that react, and that others than circuits move or find once in a step."""
 
     sub_steps: int
+    once: tuple[str, ...]
 
     @property
     def species(self) -> tuple[str, ...]:

@@ -116,6 +116,9 @@ class Transport:
         # signals that take turns with circuits, in the medium's steps; that others move, by whom
         self.in_turns: frozenset[str] = frozenset()
         self.coupled: dict[str, str] = {}
+        self.covered: Callable[[State], State] = lambda state: (
+            state
+        )  # on grids that reach all cells
         self.apart: SubSteps | None = None  # of reactions and transport, about what cells do
         self._of_step: dict[Any, Carrier] | None = None
         # weak keys: a grid no longer in use releases its steps

@@ -126,6 +126,16 @@ class Monod(Effect):
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         return (BoundMonod(self, binding),)
 
+    def check_scene(self, effects: Sequence[Effect], founders: Any) -> None:
+        for other in effects:
+            rate = getattr(other, "rate", None)
+            sets = "growth_rate" in {f.name for f in other.declares(2)} and other is not self
+            if sets and rate is not None and not (isinstance(rate, int | float) and rate == 0):
+                raise checks.InputError(
+                    "Monod sets the growth rate, but Growth has a rate of its own, which would be"
+                    " overwritten: write Growth()."
+                )
+
     def check_step(self, dt: float, divides: bool) -> None:
         if divides:
             given = numbers(self.rate)
@@ -140,11 +150,6 @@ class Monod(Effect):
             )
         if self.factor is not None:
             check_variable("Monod.factor", self.factor, state, at_least_zero=True)
-        if bool((state.growth_rate != 0).any()):
-            raise checks.InputError(
-                "Monod sets the growth rate, but Growth has a rate of its own, which would be"
-                " overwritten: write Growth()."
-            )
 
 
 class BoundMonod(BoundEffect):
@@ -204,11 +209,11 @@ class BoundMonod(BoundEffect):
                     " tf.Monod(…, factor='factor')."
                 )
 
-    def trace(self, state: State) -> State:
-        return state  # a rate of Growth's own is still to be seen
-
     def ready(self, state: State) -> State:
         """With the growth rate at the first concentrations, which rules and frames find."""
+        if self.transport is None:  # not yet bound to the others
+            return state
+        state = self.transport.covered(state)
         medium = MediumExchange(state, (self.effect.signal,))
         medium.find()
         found = medium.found[self.effect.signal].double()

@@ -3,7 +3,7 @@ scene starts from."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -91,11 +91,11 @@ def restore_state(
             for n in results.signal_names
         }
     recorded |= results.colony_fields(frame)
-    declared = dict(template.declared)
+    declared, hidden = dict(template.declared), results.internal_fields
     effects = () if scene is None else scene.effects
     kept = [name for effect in effects for name in effect.keeps().values()]
     for name, about in declared_fields(results.attributes).items():
-        there, known = partial(_field, name, about, recorded), declared.get(name)
+        there, known = partial(_field, name, about, recorded, hidden), declared.get(name)
         # what is another quantity to a changed scene is refused where that goes on
         if known is None or (changed and another_quantity(there(), known, kept)):
             declared[name] = there()
@@ -157,9 +157,14 @@ def _bare(results: Results, frame: int, device: torch.device) -> State:
     )  # fmt: skip
 
 
-def _field(name: str, about: list, recorded: Mapping[str, np.ndarray]) -> Field:
+def _field(
+    name: str, about: list, recorded: Mapping[str, np.ndarray], hidden: Container[str]
+) -> Field:
     """A field that the file holds and the scene does not declare, such as a column of the initial
     cells."""
     meaning, unit, scope, shape, at_division = about
     dtype = torch.from_numpy(np.atleast_1d(recorded[name])).dtype
-    return Field(name, meaning, unit, scope, tuple(shape), dtype, at_division=at_division)
+    return Field(
+        name, meaning, unit, scope, tuple(shape), dtype, at_division=at_division,
+        internal=name in hidden,
+    )  # fmt: skip
