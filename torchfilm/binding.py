@@ -130,7 +130,8 @@ def taken_over(scene: Scene, state: State) -> State:
     # cells may be beyond a medium that others have grown without
     strange = [e for e in model.effects if e in media or not new.isdisjoint(own(e))]
     for effect in model.effects:
-        if effect in strange or isinstance(effect, BoundRules | BoundCircuit):
+        follows = isinstance(effect, BoundRules | BoundCircuit) or effect.moves_signals
+        if effect in strange or follows:
             made = effect.ready(made)
     model.check(made)
     for effect in strange:

@@ -3,6 +3,7 @@ whole steps lose."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -201,3 +202,36 @@ def test_where_nutrition_moves_what_reacts_reactions_take_whole_steps(options):
 def test_explain_asks_for_no_step_more_than_rounding():
     said = " ".join(str(tf.explain(pattern(20, first=1e-9))).split())
     assert "or less: Medium(steps" not in said
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sensing(tf.Effect):
+    """Finds a signal before cells grow."""
+
+    stage, title = 25, "sensing"
+
+    def reads(self):
+        return ("out.b", "position")
+
+    def step(self, state, dt, values):
+        return state
+
+
+@pytest.mark.parametrize("exchange", ["together", "turns"])
+def test_what_finds_a_signal_before_growth_finds_it_half_way(exchange):
+    scene = still(0.2, True, steps=3, exchange=exchange)
+    with_it = scene.replace(Sensing(), *scene.effects)
+    assert "3 sub-steps" in str(tf.explain(scene))
+    said = str(tf.explain(with_it))
+    assert "b: others move or find it once a step" in said and "3 sub-steps" not in said
+
+
+def test_explain_asks_for_steps_where_only_some_are_moved_once():
+    reactions = [tf.Reaction.of("food -> b", rate=9.0), tf.Reaction.of("b -> c", rate=9.0)]
+    signals = {"food": tf.Signal(50.0, initial=1.0), "b": tf.Signal(5.0), "c": tf.Signal(5.0)}
+    scene = tf.Scene(
+        tf.Growth(), tf.Monod("food", rate=1.0, half=0.1), tf.MediumReactions(reactions),
+        tf.Medium(**signals, **BOX), founders=FOUR, dim=2, dt=0.1,
+    )  # fmt: skip
+    said = str(tf.explain(scene))
+    assert "food: others move or find it once" in said and "or less: Medium(steps=9)" in said

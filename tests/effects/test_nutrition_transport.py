@@ -356,3 +356,31 @@ def test_a_source_feeds_each_colony_at_its_own_rate_of_exchange(backend):
         alone, mine = fed([diffusion], streams=[k]), together.select([k])
         for name in ("out.food", "food_eaten"):
             torch.testing.assert_close(mine.fields[name], alone.fields[name], rtol=1e-12, atol=0)
+
+
+def on_food(growth: tf.Growth, rate: float = 1.0, **extra) -> tf.Scene:
+    first = tf.Cells([[0.0, 0.0], [3.0, 0.0]], [[1.0, 0.0]] * 2, length=2.0, extra=extra)
+    food = tf.Medium(food=tf.Signal(5.0, initial=1.0), box=((-10, -10), (10, 10)), spacing=2.0)
+    return tf.Scene(growth, tf.Monod("food", rate=rate), food, founders=first, dim=2)
+
+
+@pytest.mark.parametrize("growth", [tf.Growth(), tf.Growth(rate=0.0), tf.Growth(rate=[0.0, 0.0])])
+def test_growth_without_a_rate_begins_with_that_of_the_food(growth):
+    model = on_food(growth).bind(2)
+    state = model.start()
+    assert torch.allclose(state.growth_rate, torch.full_like(state.growth_rate, 0.5))
+    assert torch.equal(model.step(state, 0.0).growth_rate, state.growth_rate)
+
+
+@pytest.mark.parametrize(
+    "scene", [on_food(tf.Growth(), growth_rate=[0.7, 0.9]), on_food(tf.Growth(rate=1.0))]
+)
+def test_rates_that_would_be_overwritten_are_refused(scene):
+    with pytest.raises(tf.InputError, match=r"Growth has a rate of its own, or the founders"):
+        scene.bind()
+
+
+def test_a_scene_with_another_rate_takes_over():
+    state = tf.simulate(on_food(tf.Growth()), until=0.1).last()
+    taken = on_food(tf.Growth(), rate=2.0).take_over(state)
+    assert torch.allclose(taken.growth_rate, 2.0 * state.growth_rate, rtol=0.02)

@@ -146,11 +146,12 @@ class BoundMedium(MediumPart):
         eaten = {n for n in names if transport.coupled.get(n) == "nutrition"}
         moved = names - transport.coupled.keys()
         # what acts on these once in a step would have most of the reactions on one side
-        once = sorted(eaten | (moved.difference(free) if with_cells else set()))
-        lopsided = once and (with_cells or not self.effect.halves)
+        once = sorted(eaten | (names.difference(free) if with_cells else set()))
+        lopsided = bool(once) and (with_cells or not self.effect.halves)
+        whole = lopsided or not (moved or with_cells)
         for effect in reactions:
-            effect.sub_steps, effect.once = 1, tuple(once)
-        if steps == 1 or not reactions or lopsided or not (moved or with_cells):
+            effect.sub_steps, effect.once, effect.whole = 1, tuple(once), whole
+        if steps == 1 or not reactions or whole:
             return
         for effect in reactions:
             effect.sub_steps = steps

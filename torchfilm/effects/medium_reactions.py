@@ -148,8 +148,7 @@ class BoundReactions(BoundEffect):
     effect: MediumReactions
     first: BoundReactions | None = None  # the other half, which was traced before
     acts_without_cells = False  # whether the medium changes from the start
-    # of each step, in which reactions and transport take turns; and signals that do not
-    sub_steps, once = 1, ()
+    sub_steps, once, whole = 1, (), False  # see `medium_substeps.Reacting`
 
     def __init__(self, effect: MediumReactions, binding: Binding):
         super().__init__(effect, binding)
@@ -350,7 +349,7 @@ class BoundReactions(BoundEffect):
         changed = rate * dt / sub_steps
         # rounding of differences asks for no step more
         enough = math.ceil(0.999 * sub_steps * changed / SMALL) if changed < math.inf else 1
-        hint = f": Medium(steps={enough})" if enough > sub_steps and not self.once else ""
+        hint = f": Medium(steps={enough})" if enough > sub_steps and not self.whole else ""
         what, over = ("sub-step", dt / sub_steps) if sub_steps > 1 else ("step", dt)
         return [
             f"{sub_steps} sub-steps of {over:g} h, in turns with transport, timed with it (Strang)"

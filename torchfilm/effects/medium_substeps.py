@@ -23,10 +23,12 @@ REACT, CARRY = "react", "carry"
 @runtime_checkable
 class Reacting(Protocol):
     """Bound reactions in the medium. sub_steps: of each step, of which `step` does half of one.
-    once: signals that react, and that others than circuits move or find once in a step."""
+    once: signals that react, and that others than circuits move or find once in a step. whole:
+    whether reactions take whole steps, whatever `Medium.steps`."""
 
     sub_steps: int
     once: tuple[str, ...]
+    whole: bool
 
     @property
     def species(self) -> tuple[str, ...]:

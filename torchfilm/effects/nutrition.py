@@ -126,16 +126,6 @@ class Monod(Effect):
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         return (BoundMonod(self, binding),)
 
-    def check_scene(self, effects: Sequence[Effect], founders: Any) -> None:
-        for other in effects:
-            rate = getattr(other, "rate", None)
-            sets = "growth_rate" in {f.name for f in other.declares(2)} and other is not self
-            if sets and rate is not None and not (isinstance(rate, int | float) and rate == 0):
-                raise checks.InputError(
-                    "Monod sets the growth rate, but Growth has a rate of its own, which would be"
-                    " overwritten: write Growth()."
-                )
-
     def check_step(self, dt: float, divides: bool) -> None:
         if divides:
             given = numbers(self.rate)
@@ -157,6 +147,7 @@ class BoundMonod(BoundEffect):
 
     effect: Monod
     moves_signals = True
+    begun = False  # whether it has set growth rates of a first state
 
     @property
     def transport(self) -> Any:
@@ -213,6 +204,7 @@ class BoundMonod(BoundEffect):
         """With the growth rate at the first concentrations, which rules and frames find."""
         if self.transport is None:  # not yet bound to the others
             return state
+        self.begun = True
         state = self.transport.covered(state)
         medium = MediumExchange(state, (self.effect.signal,))
         medium.find()
@@ -227,7 +219,18 @@ class BoundMonod(BoundEffect):
             }
         return state.with_fields(**{n: x.to(state.fields[n].dtype) for n, x in changed.items()})
 
+    def check(self, state: State) -> None:
+        super().check(state)
+        if not self.begun and bool((state.growth_rate != 0).any()):
+            raise checks.InputError(
+                "Monod sets the growth rate, but Growth has a rate of its own, or the founders or"
+                " another effect bring one, which would be overwritten: write Growth(), and leave"
+                " growth_rate out."
+            )
+
     def step(self, state: State, dt: float) -> State:
+        if dt == 0:
+            return state
         parts = self.transport.medium.steps
         for done in range(parts):
             state = self._part(state, dt / parts, done, parts)
