@@ -121,8 +121,8 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="200 cells")
     parser.add_argument("--out", type=out_file, help="JSON file; the picture is beside it")
     options = parser.parse_args()
-    name = "growth_regimes.json"
-    out = options.out or (out_file(f"runs/{name}") if options.quick else None)
+    file = "growth_regimes.json"
+    out = options.out or (out_file(f"runs/{file}") if options.quick else None)
     tf.keep_memory()
     cells, free_hours = (200, 7.0) if options.quick else (2000, FREE_HOURS)
     courses = {
@@ -136,9 +136,9 @@ def main() -> None:
         print(summary(name, courses[name], courses[FREE]))
     record = {"machine": machine(), "colonies": COLONIES, "seed": SEED}
     record |= {"courses": {name: found.record() for name, found in courses.items()}}
-    (out or HERE / "benchmarks" / name).write_text(json.dumps(record) + "\n")
+    (out or HERE / "benchmarks" / file).write_text(json.dumps(record) + "\n")
     pictures = HERE.parent / "docs" / "pictures"
-    draw(courses, (out or pictures / name).with_suffix(".png"))
+    draw(courses, (out or pictures / file).with_suffix(".png"))
 
 
 if __name__ == "__main__":
