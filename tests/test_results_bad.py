@@ -391,7 +391,7 @@ def test_a_disk_that_is_really_full(tmp_path, every_step):
 def test_a_state_needs_its_scene_first(tmp_path):
     scene = make_scene()
     record(scene, scene.bind().start(), tmp_path / "run.h5", until=DT)
-    words = r"scene = -1.*results\.state\(scene\) for the last"
+    words = r"scene = -1.*results\.state\(scene, frame\), or results\.state\(frame=…\)"
     with tf.Results(tmp_path / "run.h5") as results, pytest.raises(tf.InputError, match=words):
         results.state(-1)
 
