@@ -9,7 +9,15 @@ import math
 import pytest
 import torch
 from exchanging_cells import totals
-from test_medium_reactions import BOX, F64, FOUR, in_the_middle, later, quiet
+from test_medium_reactions import (
+    BOX,
+    F64,
+    FOUR,
+    assert_batch_changes_no_bit,
+    in_the_middle,
+    later,
+    quiet,
+)
 
 import torchfilm as tf
 
@@ -104,11 +112,7 @@ def test_a_colony_does_not_depend_on_its_batch():
         tf.MediumReactions(AUTOCATALYSIS), tf.Growth(rate=1.0), tf.Mechanics(dim=2),
         tf.Division(length=4.0), two_signals(steps=3),
     )  # fmt: skip
-    three = later(scene, 1.0, colonies=3, dtype=torch.float32)
-    half = later(scene, 0.5, streams=[1], dtype=torch.float32)
-    *_, again = tf.simulate(scene, half, until=1.0)
-    for one in (later(scene, 1.0, streams=[1], dtype=torch.float32), again):
-        assert torch.equal(three.select([1]).signals["b"], one.signals["b"])
+    assert_batch_changes_no_bit(scene, "b")
 
 
 def test_what_fails_in_any_sub_step_fails_the_colony():

@@ -150,11 +150,10 @@ class BoundMedium(MediumPart):
         lopsided = bool(once) and (with_cells or not self.effect.halves)
         whole = lopsided or not (moved or with_cells)
         for effect in reactions:
-            effect.sub_steps, effect.once, effect.whole = 1, tuple(once), whole
+            effect.sub_steps = 1 if whole else steps
+            effect.once, effect.whole = tuple(once), whole
         if steps == 1 or not reactions or whole:
             return
-        for effect in reactions:
-            effect.sub_steps = steps
         if with_cells:
             transport.in_turns |= moved
             self.sub_steps = SubSteps(reactions[0], transport, transport.in_turns)
