@@ -343,7 +343,10 @@ def test_a_switch_has_one_scale_whether_it_is_on_or_off(values):
 
 @pytest.mark.parametrize(
     ("colour", "hint"),
-    [("age", "Tables and ParaView have it"), ("out.ahl", "drawn by background='ahl'")],
+    [
+        ("age", "a state does not know the lines of descent"),
+        ("out.ahl", "drawn by background='ahl'"),
+    ],
 )
 def test_what_only_tables_have_is_not_taken_for_a_slip(colour, hint):
     *_, state = tf.simulate(tf.scenes.quorum_sensing(), cells=2)

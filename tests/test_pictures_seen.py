@@ -14,10 +14,12 @@ from torchfilm.pictures import colours
 from torchfilm.pictures.categories import colours_by_number
 from torchfilm.pictures.colours import PlotStyle
 from torchfilm.pictures.frames import RecordedFrames, _solid, frame_of
+from torchfilm.pictures.place_and_time import known_quantities, unit_at_cells
 
 matplotlib = pytest.importorskip("matplotlib")
 from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
+from matplotlib.text import Text  # noqa: E402
 
 # linear light of a deuteranope and a protanope (Machado, Oliveira and Fernandes, 2009)
 DEUTERANOPE = np.array(
@@ -242,7 +244,7 @@ def test_cells_of_a_file_have_the_colours_of_their_founders(tmp_path):
     )  # fmt: skip
     *_, state = tf.simulate(scene, until=1.5, colonies=2, record=tmp_path / "run.h5")
     with tf.Results(tmp_path / "run.h5") as results:
-        first, last = RecordedFrames(results, [0, -1], colour="founder")
+        first, last = RecordedFrames(results, [0, -1], asked=["founder"])
         tree, (plain,) = results.lineage(), RecordedFrames(results, [-1])
     assert "founder" not in plain.cells
     assert len(last.cells["uid"]) >= 4 * len(first.cells["uid"]) == 40
@@ -273,5 +275,48 @@ def test_a_quantity_that_is_called_founder_is_drawn_as_it_is(tmp_path):
     scene = tf.Scene(tf.Growth(rate=0.5), tf.Mechanics(dim=2), founders=cells, dt=0.1)
     list(tf.simulate(scene, until=0.1, record=tmp_path / "run.h5"))
     with tf.Results(tmp_path / "run.h5") as results:
-        (frame,) = RecordedFrames(results, [0], colour="founder")
+        (frame,) = RecordedFrames(results, [0], asked=["founder"])
     assert frame.cells["founder"].tolist() == [7.5, 3.0]
+
+
+def test_volumes_and_ages_are_drawn_where_they_are_asked_for(tmp_path):
+    """As tables have them, in frames and in what is drawn over time."""
+    path = tmp_path / "run.h5"
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Division(length=3.0), tf.Mechanics(dim=2), dt=0.1,
+        founders=tf.Cells([[0.0, 0.0], [9.0, 0.0]], [[0.0, 1.0]] * 2, [1.6, 2.6]),
+    )  # fmt: skip
+    *_, state = tf.simulate(scene, until=1.5, colonies=2, record=path)
+    with tf.Results(path) as results:
+        table, frames = results.to_pandas(), RecordedFrames(results, [0, -1], asked=["age", "born"])
+        for place, frame in zip((0, len(results) - 1), frames, strict=True):
+            rows = table[table.frame == place]
+            assert len(rows) == len(frame.cells["uid"]) and "volume" not in frame.cells
+            for name in ("age", "born"):
+                assert np.allclose(frame.cells[name], rows[name])
+            assert np.allclose(frame.asked(["volume"]).cells["volume"], rows["volume"])
+        assert np.ptp(frame.cells["age"]) > 0.3
+        seen = list(known_quantities(results, "volume", "age", "born"))
+        for name in ("volume", "age", "born"):
+            drawn = np.concatenate([known[name] for _, known in seen])
+            assert np.allclose(drawn, table.sort_values("frame", kind="stable")[name])
+        assert [unit_at_cells(results, n) for n in ("volume", "age", "born")] == ["µm³", "h", "h"]
+    assert np.allclose(
+        frame_of(state).asked(["volume"]).cells["volume"], state.volume.cpu().numpy()
+    )
+    for options in ({"colour": "age"}, {"channels": {"age": "cyan", "volume": "yellow"}}):
+        seen = {text.get_text() for text in tf.show(path, **options).figure.findobj(Text)}
+        for name in options.get("channels", ["age"]):
+            assert {"age": "age (h)", "volume": "volume (µm³)"}[name] in seen
+    pictures.time_course(path, "age", "volume", out=tmp_path / "course.png")
+    tf.show(state, colour="volume")
+
+
+def test_a_quantity_that_is_called_age_is_drawn_as_it_is(tmp_path):
+    cells = tf.Cells([[0.0, 0.0], [3.0, 0.0]], [[0.0, 1.0]] * 2, 2.0, extra={"age": [7.5, 3.0]})
+    scene = tf.Scene(tf.Growth(rate=0.5), tf.Mechanics(dim=2), founders=cells, dt=0.1)
+    list(tf.simulate(scene, until=0.1, record=tmp_path / "run.h5"))
+    with tf.Results(tmp_path / "run.h5") as results:
+        (frame,) = RecordedFrames(results, [0], asked=["age"])
+        (_, known), _ = known_quantities(results, "age")
+    assert frame.cells["age"].tolist() == known["age"].tolist() == [7.5, 3.0]

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from torchfilm.pictures.categories import KINDS, MOST_TYPES, colours_of_kinds
-from torchfilm.pictures.frames import FOUNDER, Frame, unit_of
+from torchfilm.pictures.frames import FOUNDER, OF_FILES, Frame, unit_of
 from torchfilm.pictures.shapes import VIEWS
 from torchfilm.state import OUTSIDE
 from torchfilm.tools import checks
@@ -39,10 +39,8 @@ RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 Beyond = Literal["neither", "both", "min", "max"]
 Limits = Mapping[str, tuple[float, float]]
-# What tables have of each cell, and no frame holds.
-NOT_DRAWN = dict.fromkeys(
-    ("age", "born", "volume"), "Tables and ParaView have it (to_pandas, export); pictures do not."
-) | {FOUNDER: "It is a colour of a results file: a state does not know the lines of descent."}
+# Colours that no state has.
+NOT_OF_STATES = "It is a colour of a results file: a state does not know the lines of descent."
 
 
 @dataclass(frozen=True)
@@ -199,14 +197,16 @@ class PlotStyle:
             if is_rgb(frame.cells, name) and (alone or name in self._logarithmic):
                 raise checks.input_error("log", self.log, f"left out: {name} is a colour itself")
         known = [n for n, v in frame.cells.items() if v.ndim == 1]
-        if self.channels is None:
-            known += [*(n for n in frame.cells if is_rgb(frame.cells, n)), *frame.if_asked]
+        rgb = self.channels is None
+        known += [n for n in frame.cells if rgb and is_rgb(frame.cells, n)]
+        known += [n for n in frame.if_asked if n not in known and (rgb or n != FOUNDER)]
         for name in self.quantities:
             if name not in known and not (name == ANGLE and self.channels is None):
                 what = "colour" if self.channels is None else "channels"
                 listed = [n for n in known if n not in frame.internal]
                 rule = ("'angle' or " if self.channels is None else "") + "one of "
-                hint = NOT_DRAWN.get(name) or checks.suggestion(name, [ANGLE, *listed])
+                of_files = name in OF_FILES and name not in frame.if_asked
+                hint = NOT_OF_STATES if of_files else checks.suggestion(name, [ANGLE, *listed])
                 if name.startswith(OUTSIDE):
                     signal = name.removeprefix(OUTSIDE)
                     hint = f"What is outside of cells is drawn by background={signal!r}."

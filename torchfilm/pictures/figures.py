@@ -55,11 +55,11 @@ def show(
     with the `scene` whose walls are drawn: a state does not know them; or a `Frame`.
 
     colour: the quantity that colours the cells: "angle", the direction of their axes, or any
-    quantity per cell by name; of a file also "founder", a colour for each line of descent. The
-    default is the type of the cells where there are several, else the first species of a circuit,
-    else the angle. channels: instead of colour, several quantities at once as in fluorescence
-    microscopy, each with the colour of its light; the colours add up: {"cfp": "cyan", "yfp":
-    "yellow"}. background: a signal of the medium, white lowest and black highest.
+    quantity per cell by name, or "volume", µm³; of a file also "age" and "born", h, and "founder",
+    a colour for each line of descent. The default is the type of the cells where there are several,
+    else the first species of a circuit, else the angle. channels: instead of colour, several
+    quantities as in fluorescence microscopy, each with the colour of its light, which add up:
+    {"cfp": "cyan", "yfp": "yellow"}. background: a signal of the medium, from white to black.
 
     values: quantities of your own of a state, by name, one number for each cell: `values={"real
     growth (1/h)": tf.measure.growth_rates(state, earlier)}`; or three, its red, green and blue. The
@@ -87,7 +87,7 @@ def show(
         colour = next(iter(values))
     style = PlotStyle(colour, channels, background, limits, view, section, whole, log)
     if isinstance(what, (State, Frame)):
-        shown, heading = _with(values, _given_frame(what, scene, frame)), name_of(scene)
+        shown, heading = _given_frame(what, scene, frame, values, style), name_of(scene)
     elif values:
         rule = "left out for results: they are of the cells of one state"
         raise checks.input_error("values", list(values), rule)
@@ -105,7 +105,7 @@ def state_figure(
     dpi: float,
 ) -> Figure | None:
     """A state as a figure, with the colonies of `colonies` that have cells; None without any."""
-    frame = frame_of(state, scene)
+    frame = frame_of(state, scene).asked(style.quantities)
     alive = set(frame.colony_id[frame.counts > 0].tolist())
     if colonies is not None:
         colonies = [c for c in colonies if c in alive]
@@ -139,14 +139,21 @@ def name_of(scene: Scene | None) -> str:
     return "" if scene is None else f"{scene.name}, "
 
 
-def _given_frame(what: State | Frame, scene: Scene | None, frame: int) -> Frame:
-    """The frame of a state."""
+def _given_frame(
+    what: State | Frame,
+    scene: Scene | None,
+    frame: int,
+    values: Mapping[str, Any] | None,
+    style: PlotStyle,
+) -> Frame:
+    """The frame of a state, with quantities of the user's own and those that colour its cells."""
     if frame != -1:
         rule = "left out for a state, which is of one time"
         raise checks.input_error("frame", frame, rule)
     if isinstance(what, Frame) and scene is not None:
         raise checks.InputError("show got a frame and a scene: a frame has its own walls.")
-    return what if isinstance(what, Frame) else frame_of(what, scene)
+    given = what if isinstance(what, Frame) else frame_of(what, scene)
+    return _with(values, given).asked(style.quantities)
 
 
 def _with(values: Mapping[str, Any] | None, frame: Frame) -> Frame:
@@ -176,7 +183,7 @@ def _recorded_frame(
         raise checks.InputError("show got results and a scene: results have their own walls.")
     with opened(what) as results:
         check_not_results(results.path, out)
-        recorded = RecordedFrames(results, [frame], style.background, style.colour)
+        recorded = RecordedFrames(results, [frame], style.background, style.quantities)
         return recorded[0], f"{recorded.title}, "
 
 
@@ -211,7 +218,7 @@ def strip(
     with opened(what) as results:
         check_not_results(results.path, out)
         chosen = choose_frames(results.times, times, count)
-        recorded = RecordedFrames(results, chosen, background, colour)
+        recorded = RecordedFrames(results, chosen, background, style.quantities)
         places, more = choose_colonies(
             recorded.shown(style.shows_box), results.colony_id, colonies, 4
         )

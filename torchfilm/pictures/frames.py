@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
 
 from torchfilm.io.identity import walls_of
 from torchfilm.io.layout import OBSTACLES
 from torchfilm.io.lineage import Lineage
 from torchfilm.io.parameters import column_names
 from torchfilm.io.results import Results
+from torchfilm.physics import capsule
 from torchfilm.pictures.categories import colours_by_number
 from torchfilm.scene import Scene
 from torchfilm.state import CELL, PER_CELL, State
 from torchfilm.tools import checks
 
-UNITS = {"length": "µm", "radius": "µm"}
-FOUNDER = "founder"  # a colour for each line of descent; only a file knows the lines
+UNITS = {"length": "µm", "radius": "µm", "volume": "µm³", "age": "h", "born": "h"}
+FOUNDER = "founder"  # a colour for each line of descent
+# What is worked out of cells only where it is asked for; ages and founders, a file alone knows.
+VOLUME, AGES = "volume", ("age", "born")
+OF_FILES = (*AGES, FOUNDER)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +41,7 @@ class Frame:
     do not list. names: of the colonies, (B,), for titles; by default their ids. solid: where the
     obstacles of a medium are, one array (nx, ny, nz) bool per colony; empty without them.
     if_asked: what colours cells besides their quantities, and is worked out only where it is asked
-    for.
+    for: of a state `volume`.
     """
 
     cells: Mapping[str, np.ndarray]
@@ -53,7 +58,13 @@ class Frame:
     internal: Collection[str] = ()
     names: Sequence[str] | None = None
     solid: Sequence[np.ndarray] = ()
-    if_asked: Collection[str] = ()
+    if_asked: Collection[str] = (VOLUME,)
+
+    def asked(self, names: Collection[str]) -> Frame:
+        """The frame, with the volumes of its cells where they are among `names`."""
+        if VOLUME not in names or VOLUME in self.cells:
+            return self
+        return replace(self, cells={**self.cells, VOLUME: volumes(self.cells)})
 
     def name(self, place: int) -> str:
         """What a title calls the colony at this index of the batch."""
@@ -76,6 +87,32 @@ class Frame:
         """The cells of one colony, by its index in the batch."""
         part = slice(self._ends[place], self._ends[place + 1])
         return {name: value[part] for name, value in self.cells.items()}
+
+
+def volumes(cells: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Volume of each cell, (N,) float64, µm³."""
+    size = (torch.from_numpy(cells[n].astype(float)) for n in ("length", "radius"))
+    return capsule.volume(*size).numpy()
+
+
+def of_lineage(
+    lineage: Lineage,
+    ids: np.ndarray,
+    cells: Mapping[str, np.ndarray],
+    times: float | np.ndarray,
+    names: Collection[str],
+) -> dict[str, np.ndarray]:
+    """Those of "age", "born" (N,), h, and "founder" (N, 3), a colour, that are among `names`. ids:
+    of the colonies, (B,). times: at which cells are seen, h, one or (N,)."""
+    rows = lineage.rows(ids[cells["colony"]], cells["uid"])
+    born, found = lineage.born[rows], {}
+    if "age" in names:
+        found["age"] = times - born
+    if "born" in names:
+        found["born"] = born
+    if FOUNDER in names:
+        found[FOUNDER] = colours_by_number(lineage.founder[rows])
+    return found
 
 
 def frame_of(state: State, scene: Scene | None = None) -> Frame:
@@ -118,17 +155,18 @@ def _parted(values: np.ndarray, shapes: np.ndarray) -> list[np.ndarray]:
 
 
 class RecordedFrames(Sequence[Frame]):
-    """Some frames of a results file, each read on access, with one signal or none. colour: of the
-    cells; they have their founders' colours where it is "founder"."""
+    """Some frames of a results file, each read on access, with one signal or none. asked: names of
+    quantities, of which cells also have those that are worked out only then: "volume", "age",
+    "born", and "founder", a colour for each line of descent."""
 
     def __init__(
         self,
         results: Results,
         places: Sequence[int],
         signal: str | None = None,
-        colour: str | None = None,
+        asked: Collection[str] = (),
     ):
-        self.results, self.signal, self.colour = results, signal, colour
+        self.results, self.signal, self.asked = results, signal, asked
         self.places = [results._index(k) for k in places]
         declared = json.loads(results.attributes["declared"])
         self.units, self.walls = {name: entry[1] for name, entry in declared.items()}, results.walls
@@ -146,15 +184,14 @@ class RecordedFrames(Sequence[Frame]):
 
     def __getitem__(self, k):
         if isinstance(k, slice):
-            return RecordedFrames(self.results, self.places[k], self.signal, self.colour)
+            return RecordedFrames(self.results, self.places[k], self.signal, self.asked)
         results, place = self.results, self.places[k]
         cells, ids, time = results.frame(place), results.colony_id, float(results.times[place])
-        if self.colour == FOUNDER and FOUNDER not in cells:
-            rows = self._lineage.rows(ids[cells["colony"]], cells["uid"])
-            cells = {**cells, FOUNDER: colours_by_number(self._lineage.founder[rows])}
-        if_asked = () if FOUNDER in cells else (FOUNDER,)
+        if wanted := [n for n in OF_FILES if n in self.asked and n not in cells]:
+            cells = {**cells, **of_lineage(self._lineage, ids, cells, time, wanted)}
+        if_asked = (VOLUME, *OF_FILES)
         if not results.signal_names:
-            return Frame(
+            frame = Frame(
                 cells,
                 time,
                 ids,
@@ -165,10 +202,11 @@ class RecordedFrames(Sequence[Frame]):
                 names=_named(results.parameters(place)),
                 if_asked=if_asked,
             )
+            return frame.asked(self.asked)
         origin, shape, spacing = results.grid(place)
         signals = {} if self.signal is None else {self.signal: results.signal(self.signal, place)}
         height = results.attributes.get("height")
-        return Frame(
+        frame = Frame(
             cells,
             time,
             ids,
@@ -185,6 +223,7 @@ class RecordedFrames(Sequence[Frame]):
             _solid(self._obstacles, shape),
             if_asked,
         )
+        return frame.asked(self.asked)
 
     @cached_property
     def _lineage(self) -> Lineage:

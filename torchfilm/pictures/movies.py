@@ -73,7 +73,7 @@ def movie(
         check_not_results(results.path, out)
         last = len(results) - 1
         drawn = sorted({*range(0, last + 1, every), last})
-        frames = RecordedFrames(results, drawn, background, colour)
+        frames = RecordedFrames(results, drawn, background, style.quantities)
         places, more = choose_colonies(
             frames.shown(style.shows_box), results.colony_id, colonies, 9
         )

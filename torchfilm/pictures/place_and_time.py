@@ -13,9 +13,9 @@ import torch
 from torchfilm.io.blocks import blocks
 from torchfilm.io.identity import declared_fields
 from torchfilm.io.results import Results
-from torchfilm.physics import capsule
 from torchfilm.pictures.colours import MEAN, PlotStyle, Scale, ValueRange, checked_range, scale_of
 from torchfilm.pictures.figures import check_not_results, opened
+from torchfilm.pictures.frames import AGES, VOLUME, of_lineage, unit_of, volumes
 from torchfilm.pictures.page import checked_dpi
 from torchfilm.pictures.picture import Picture, new_figure
 from torchfilm.spatial import binned_mean, checked_edges
@@ -46,11 +46,12 @@ def kymograph(
     left to right, time from top to bottom. A field is the mean over the cells in a bin at a
     recorded frame, and empty without cells.
 
-    what: a results file, or its path. quantity: a field of the cells, or a signal at them as
-    "out.NAME". along: "x", "y", "z", or "radius" from the colony's centre. edges: of the bins, µm,
-    ascending; default bins of 1 µm where there are cells. colony: its id; default the first.
-    limits: the range of colours; default that of the means, of a concentration 1 % or wider. log:
-    logarithmic colours, as for `show`. out: save the picture there."""
+    what: a results file, or its path. quantity: a field of the cells, "volume", "age" or
+    "born", or a signal at them as "out.NAME". along: "x", "y", "z", or "radius" from the colony's
+    centre. edges: of the bins, µm, ascending; default bins of 1 µm where there are cells. colony:
+    its id; default the first. limits: the range of colours; default that of the means, of a
+    concentration 1 % or wider. log: logarithmic colours, as for `show`. out: save the picture
+    there."""
     with opened(what) as results:
         check_not_results(results.path, out)
         checks.choice("along", along, ALONG[: int(results.attributes["dim"])] + ALONG[3:])
@@ -125,20 +126,25 @@ def _seen(
     position, value = cells["position"][mine], known[quantity][mine].astype(float)
     if along != "radius":
         return position[:, "xyz".index(along)], value
-    size = (torch.from_numpy(cells[n][mine].astype(float)) for n in ("length", "radius"))
-    volume = capsule.volume(*size).numpy()[:, None]
+    volume = volumes({n: cells[n][mine] for n in ("length", "radius")})[:, None]
     centre = (volume * position).sum(0) / volume.sum() if len(position) else 0.0
     return np.hypot(*(position - centre)[:, :2].T), value
 
 
 def known_quantities(results: Results, *wanted: str) -> Iterator[tuple[Columns, Columns]]:
     """The cells of each frame, and what it tells of each cell, (N,) by name, signals at them under
-    "out.NAME". Raises InputError for a wanted name that the file does not tell."""
-    hidden = results.internal_fields
+    "out.NAME"; volumes, ages and hours of birth where they are wanted. Raises InputError for a
+    wanted name that the file does not tell."""
+    hidden, ids, tree = results.internal_fields, results.colony_id, None
     for block in blocks(results, range(len(results))):
         cells, signals = block.cells(), block.signals()
         known = {n: x for n, x in cells.items() if x.ndim == 1 and n not in hidden}
         known |= {OUTSIDE + n: x for n, x in signals.items()}
+        if VOLUME in wanted and VOLUME not in known:
+            known[VOLUME] = volumes(cells)
+        if asked := [n for n in AGES if n in wanted and n not in known]:
+            times = results.times[block.frames][block.which]
+            known |= of_lineage(tree or (tree := results.lineage()), ids, cells, times, asked)
         _check_known(known, signals, wanted)
         ends = np.searchsorted(block.which, np.arange(len(block.frames) + 1))
         for first, end in itertools.pairwise(ends):
@@ -149,6 +155,7 @@ def known_quantities(results: Results, *wanted: str) -> Iterator[tuple[Columns, 
 def _check_known(known: Columns, signals: Columns, wanted: Sequence[str]) -> None:
     """Raise InputError for a wanted name that no cell has. signals: at the cells, by name."""
     names = [n for n in known if n not in ("uid", "parent", "colony")]
+    names += [n for n in (VOLUME, *AGES) if n not in known]
     for quantity in wanted:
         if not isinstance(quantity, str):
             hint = 'Several follow one another: time_course(results, "gfp", "rfp").'
@@ -171,4 +178,4 @@ def _bins(places: np.ndarray, edges: Sequence[float] | None) -> np.ndarray:
 def unit_at_cells(results: Results, quantity: str) -> str:
     """The unit of a quantity of the cells, or of a signal at them; "" without."""
     declared = declared_fields(results.attributes)
-    return "µm" if quantity in ("length", "radius") else str(declared.get(quantity, ["", ""])[1])
+    return unit_of(quantity, {name: str(entry[1]) for name, entry in declared.items()})

@@ -47,13 +47,14 @@ def time_course(
     colonies differ in parameters, those of the same ones are thin lines of one colour, without a
     band, beside the mean of those that have cells.
 
-    what: a results file, or its path. quantities: fields of the cells, or signals at them as
-    "out.NAME". by: a field of whole numbers, such as "cell_type": cells of each are counted apart,
-    a colour for each, and a style of lines for each of up to four colonies. colonies: their ids;
-    default the first `most` that had cells. log: logarithmic axes of the quantities; the number of
-    cells has one where it grows more than tenfold. Where all cells of a line have died, a triangle
-    at 0 marks when; a logarithmic axis then has a 0 below 1. out: save the picture there. Raises
-    InputError for a quantity that is not recorded, and for a file of one frame."""
+    what: a results file, or its path. quantities: fields of the cells, "volume", "age" or "born",
+    or signals at them as "out.NAME". by: a field of whole numbers, such as "cell_type": cells of
+    each are counted apart, a colour for each, and a style of lines for each of up to four colonies.
+    colonies: their ids; default the first `most` that had cells. log: logarithmic axes of the
+    quantities; the number of cells has one where it grows more than tenfold. Where all cells of a
+    line have died, a triangle at 0 marks when; a logarithmic axis then has a 0 below 1. out: save
+    the picture there. Raises InputError for a quantity that is not recorded, and for a file of one
+    frame."""
     with opened(what) as results:
         check_not_results(results.path, out)
         checked_dpi(dpi)
