@@ -79,9 +79,10 @@ class Mechanics(Effect):
 
     passes: at most this many a step; later ones move only the cells deeper than `overlap`, µm, and,
     if contacts are one-sided, those near them (default 0.2 radii, 24 passes, 1 for soft cells;
-    bilateral: 0.2 radii or less, 1 pass in the plane and 2 in space, 6 with sub-steps). tolerance:
-    of a solve. One-sided: relative error of the contact forces, default 0.07. Bilateral: worst
-    residual relative to that at rest, default 0.005; where α γ is below 0.1, times (α γ/0.1)^¼.
+    bilateral: 0.2 radii or less, 1 pass in the plane and 2 in space, 6 with sub-steps). A smaller
+    `overlap` takes off growth under pressure; a smaller `contact_overlap` does not. tolerance: of a
+    solve. One-sided: relative error of the contact forces, default 0.07. Bilateral: worst residual
+    relative to that at rest, default 0.005; where α γ is below 0.1, times (α γ/0.1)^¼.
     max_iterations: CG iterations a solve. max_elongation: µm; a colony whose cells would grow more
     in a step takes sub-steps. adhesion: cells stick together, see `tf.Adhesion`; several kinds add
     up. Only one-sided contacts have it. backend: "compiled" kernels, on the CPU, or "torch".

@@ -55,7 +55,12 @@ def _hardness(effect: Mechanics, settings: OneSidedSettings | ContactSettings, d
 def _of_one_sided(
     effect: Mechanics, settings: OneSidedSettings, kind: str, device: torch.device
 ) -> list[str]:
-    deep = "0.2 radii" if settings.overlap is None else f"{settings.overlap:g} µm"
+    deep = (
+        "0.2 radii"
+        if settings.overlap is None
+        else f"{settings.overlap:g} µm (a small bound takes off growth under pressure; a smaller"
+        " contact_overlap does not)"
+    )
     passes = (
         "1 a step, as cells are soft"
         if settings.soft
