@@ -26,6 +26,7 @@ whole error.
 
 from __future__ import annotations
 
+import argparse
 import csv
 import dataclasses
 import itertools
@@ -228,6 +229,16 @@ def share(text: str) -> str:
     return text
 
 
+def rows_of(path: Path, parser: argparse.ArgumentParser) -> list[dict[str, str]]:
+    """The scenes of a file that this script wrote. Ends the script if it is another table."""
+    with path.open(newline="", encoding="utf-8") as file:
+        table = csv.DictReader(file)
+        if sorted(table.fieldnames or ()) != sorted(COLUMNS):
+            found = ", ".join(table.fieldnames or ()) or "nothing"
+            parser.error(f"--gather {path}: no file of --out; its columns are {found}")
+        return list(table)
+
+
 def main() -> None:
     parser = scenes_parser(__doc__)
     parser.add_argument("--error", type=share, default="1%", help="error to request")
@@ -244,7 +255,7 @@ def main() -> None:
     options = parser.parse_args()
     tf.keep_memory()
     torch.set_grad_enabled(False)
-    rows = [row for path in options.gather for row in csv.DictReader(path.open(newline=""))]
+    rows = [row for path in options.gather for row in rows_of(path, parser)]
     for name in () if rows else options.scene or tf.scenes.READY:
         rows.append(check(name, parse_error(options.error)))
         print(rows[-1], flush=True)
