@@ -9,9 +9,10 @@ from drawn import NEAR, Drawn, frame, ramp, viridis
 
 import torchfilm as tf
 from torchfilm.pictures import frame_of
-from torchfilm.pictures.colours import FLOOR, NO_VALUE, PlotStyle, ValueRange, scale_of
+from torchfilm.pictures.colours import FLOOR, NO_VALUE, PlotStyle, scale_of
 from torchfilm.pictures.frames import RecordedFrames
 from torchfilm.pictures.page import plan_layout, signal_section
+from torchfilm.pictures.scales import ValueRange
 from torchfilm.pictures.shapes import section
 from torchfilm.signals.exchange import read, stencil
 from torchfilm.signals.grid import Grid

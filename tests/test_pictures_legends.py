@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from torchfilm.pictures import colour_bar, draw_cells, draw_signal, scale_bar
-from torchfilm.pictures.colours import PlotStyle, ValueRange, scale_of
+from torchfilm.pictures.colours import PlotStyle, scale_of
 from torchfilm.pictures.draw import OUTSIDE_BOX, numbers
 from torchfilm.pictures.figures import sheet_figure
 from torchfilm.pictures.page import plan_layout
+from torchfilm.pictures.scales import ValueRange
 
 # --- windows --------------------------------------------------------------------------------------
 

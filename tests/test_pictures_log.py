@@ -9,8 +9,9 @@ from drawn import NEAR, Drawn, frame, viridis
 from matplotlib.colors import LogNorm
 
 import torchfilm as tf
-from torchfilm.pictures.colours import NO_VALUE, PlotStyle, ValueRange, scale_of
+from torchfilm.pictures.colours import NO_VALUE, PlotStyle, scale_of
 from torchfilm.pictures.page import plan_layout
+from torchfilm.pictures.scales import ValueRange
 
 PLACES = [[4.0 * k, 0.0] for k in range(5)]
 

@@ -15,6 +15,7 @@ from torchfilm.pictures.categories import colours_by_number
 from torchfilm.pictures.colours import PlotStyle
 from torchfilm.pictures.frames import RecordedFrames, _solid, frame_of
 from torchfilm.pictures.place_and_time import known_quantities, unit_at_cells
+from torchfilm.pictures.scales import ValueRange
 
 matplotlib = pytest.importorskip("matplotlib")
 from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
@@ -56,7 +57,7 @@ def apart(rgb: np.ndarray, seen_by: np.ndarray) -> np.ndarray:
 )
 def test_directions_look_different_to_colour_blind_readers_too(eyes, least):
     """Angles of 30° and more apart. A circle of hues has pairs with ΔE of 1."""
-    seen = colours.ValueRange()
+    seen = ValueRange()
     seen.add(np.array([0.0, 180.0]))
     scale = colours.scale_of("angle", seen, PlotStyle(), {})
     angles = np.arange(0.0, 180.0, 5.0)
@@ -88,7 +89,7 @@ def some_frame(count, **columns):
 
 @pytest.mark.parametrize("numbers", [[10, 44], [12, 300], [8, 16, 29, 42, 55], list(range(8, 16))])
 def test_numbers_of_kinds_have_colours_apart(numbers):
-    seen = colours.ValueRange()
+    seen = ValueRange()
     seen.add(np.array(numbers))
     scale = colours.scale_of("clone", seen, PlotStyle(colour="clone"), {})
     rgb = scale.paint(np.array(numbers))[:, :3]

@@ -22,6 +22,25 @@ if TYPE_CHECKING:
     from torchfilm.scene import Scene
 
 
+def checked_type_names(names: Sequence[str], founders: Cells) -> tuple[str, ...]:
+    """The names of the types of cells. Raises InputError for what are none, and where the founders
+    have no types."""
+    rule = 'names of the types 0, 1, …, such as ("sender", "receiver")'
+    if isinstance(names, str) or not isinstance(names, Sequence):
+        raise checks.input_error("Scene.type_names", names, rule)
+    for k, name in enumerate(names):
+        if not isinstance(name, str) or not name.strip() or "\n" in name:
+            raise checks.input_error(f"Scene.type_names[{k}]", name, "a name, as text in one line")
+        if name in names[:k]:
+            raise checks.input_error(f"Scene.type_names[{k}]", name, "another name than the others")
+    if names and founders.cell_type is None:
+        hint = "Such as tf.inoculum(20, 10.0, types={0: 0.5, 1: 0.5})."
+        raise checks.input_error(
+            "Scene.type_names", tuple(names), "left out: the founders have no cell_type", hint
+        )
+    return tuple(names)
+
+
 class Founders:
     """Founders that a function draws for each colony, by numbers that may differ between colonies:
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchfilm.binding import bind, taken_over
 from torchfilm.circuits.names import without_medium
 from torchfilm.effect import BUILT_IN, Effect, is_own
-from torchfilm.founders import Founders
+from torchfilm.founders import Founders, checked_type_names
 from torchfilm.initial_cells import Cells
 from torchfilm.model import Model
 from torchfilm.parameters import given, parameters, summary
@@ -30,7 +30,7 @@ from torchfilm.tools.warn_once import once, warn
 from torchfilm.values import ByType
 from torchfilm.version import __version__
 
-CHANGEABLE = ("name", "dt", "founders", "recipe", "settings", "accuracy", "dim")
+CHANGEABLE = ("name", "dt", "founders", "recipe", "settings", "accuracy", "dim", "type_names")
 NO_KEYWORD = {"effects": "Effects come first, without a name: (*effects, name=…)."}
 
 
@@ -45,7 +45,7 @@ class Scene(metaclass=checks.KnownKeywords):
     tf.Founders, whose function has further values, which may differ between colonies. dim: 2 or
     3, for a scene without mechanics. recipe: (name, parameters) of a ready-made scene, from which
     `resume` builds it again. settings: what the user's own scene function was given. accuracy:
-    accuracy settings applied so far.
+    accuracy settings applied so far. type_names: of the cells' types 0, 1, …, for pictures.
 
     `code`: versions of Python and torchfilm, and a digest of the effects, what their functions
     compute included. A rules file is known by its path, since it may change during a run.
@@ -55,6 +55,7 @@ class Scene(metaclass=checks.KnownKeywords):
     name: str
     dt: float
     dim: int
+    type_names: tuple[str, ...]
     founders: Cells  # where they are drawn, those of the first colony from the seed 0
     draw: Founders | None
     recipe: tuple[str, dict[str, Any]] | None
@@ -77,6 +78,7 @@ class Scene(metaclass=checks.KnownKeywords):
         recipe: tuple[str, dict[str, Any]] | None = None,
         settings: dict[str, Any] | None = None,
         accuracy: dict[str, float] | None = None,
+        type_names: Sequence[str] = (),
     ):
         _check_effects(effects)
         made: dict[str, Any] = {
@@ -101,6 +103,7 @@ class Scene(metaclass=checks.KnownKeywords):
                 f"{made['dim']}-D, as the mechanics are",
                 "For cells in {0}-D write Mechanics(dim={0}).".format(made["founders"].dim),
             )
+        made["type_names"] = checked_type_names(type_names, made["founders"])
         made["declared_by"] = _check_fields(effects, made["dim"], made["founders"])
         # now, before any run: what a rule refers to may change as it runs
         version = f"{sys.version_info[0]}.{sys.version_info[1]}"
@@ -265,8 +268,9 @@ class Scene(metaclass=checks.KnownKeywords):
     def headline(self) -> str:
         """Name, dimension, step and founders, in a line."""
         drawn = "" if self.draw is None else ", drawn for each colony"
-        about = f"{self.name}: {self.dim}-D, step {self.dt:g} h"
-        return f"{about}, {self.founders.count} founder(s){drawn}"
+        about = f"{self.name}: {self.dim}-D, step {self.dt:g} h, {self.founders.count} founder(s)"
+        types = ", ".join(f"{k} {name}" for k, name in enumerate(self.type_names))
+        return f"{about}{drawn}" + f", types {types}" * bool(types)
 
     def __repr__(self) -> str:
         return f"Scene({', '.join(summary(e) for e in self.effects)}, name={self.name!r})"

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 import torchfilm as tf
-from torchfilm.pictures.colours import PlotStyle, ValueRange, scale_of
+from torchfilm.pictures.colours import PlotStyle, scale_of
+from torchfilm.pictures.scales import ValueRange
 from torchfilm.tools.units import MOLECULES, NAMED, differ
 
 BOX = {"box": ((-8, -8), (8, 8)), "spacing": 4.0}

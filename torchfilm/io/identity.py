@@ -32,6 +32,7 @@ def scene_attributes(scene: Scene, model: Model | None) -> dict[str, str]:
         "effects": json.dumps(scene.listing()),
         "code": json.dumps(scene.code),
         "walls": json.dumps(walls_of(scene)),
+        "type_names": json.dumps(scene.type_names),
         "periodic": json.dumps({} if scene.space is None else scene.space.faces),
         "recipe": json.dumps(scene.recipe),
         "settings": json.dumps(scene.settings),

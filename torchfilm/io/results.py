@@ -154,6 +154,11 @@ class Results(metaclass=checks.KnownKeywords):
         return {axis: (low, high) for axis, (low, high) in found.items()}
 
     @property
+    def type_names(self) -> list[str]:
+        """The names of the cells' types 0, 1, …, as far as the scene gave them some."""
+        return read_attribute(self.file, "type_names", "[]")
+
+    @property
     def internal_fields(self) -> set[str]:
         """The fields that serve the numerics: `table` shows them only with `internals`."""
         given = self.file.attrs.get("internal")
@@ -240,11 +245,8 @@ class Results(metaclass=checks.KnownKeywords):
         if not self.signal_names:
             raise InputError(f"{self.path} has no medium, so no grid.")
         k = self._index(frame)
-        return (
-            self._read("frames/grid/origin", k),
-            self._read("frames/grid/shape", k),
-            np.asarray(self.file.attrs["spacing"]),
-        )
+        origin, shape = (self._read(f"frames/grid/{name}", k) for name in ("origin", "shape"))
+        return origin, shape, np.asarray(self.file.attrs["spacing"])
 
     @partial(checks.known_keywords, instead=BY_NUMBER)
     def signal(self, name: str, frame: int = -1) -> list[np.ndarray]:
@@ -254,12 +256,10 @@ class Results(metaclass=checks.KnownKeywords):
             raise checks.input_error("signal", name, f"one of {known}")
         k = self._index(frame)
         _, shapes, _ = self.grid(k)
-        ends = int(self._read("frames/grid/first_voxel", k)) + np.concatenate(
-            [[0], np.cumsum(shapes.prod(1))]
-        )
-        read = partial(self._read, f"signals/{name}")
+        first = int(self._read("frames/grid/first_voxel", k))
+        ends = first + np.concatenate([[0], np.cumsum(shapes.prod(1))])
         return [
-            read(slice(a, b)).reshape(tuple(shape))
+            self._read(f"signals/{name}", slice(a, b)).reshape(tuple(shape))
             for a, b, shape in zip(ends[:-1], ends[1:], shapes, strict=True)
         ]
 

@@ -73,6 +73,10 @@ def _are_fields(found: Any) -> bool:
     return isinstance(found, dict) and all(map(five, found.values()))
 
 
+def _are_texts(found: Any) -> bool:
+    return isinstance(found, list) and all(isinstance(x, str) for x in found)
+
+
 # What the attributes hold as JSON. Those that files of earlier versions lack may be missing.
 ATTRIBUTES: dict[str, Callable[[Any], bool]] = {
     "declared": _are_fields,
@@ -81,15 +85,12 @@ ATTRIBUTES: dict[str, Callable[[Any], bool]] = {
     "accuracy": lambda x: isinstance(x, dict) and all(map(_is_number, x.values())),
     "walls": lambda x: isinstance(x, list) and all(isinstance(w, dict) for w in x),
     "periodic": _are_spans,
-    "internal": lambda x: isinstance(x, list) and all(isinstance(n, str) for n in x),
-    "effects": lambda x: x is None or (isinstance(x, list) and all(map(_is_text, x))),
+    "internal": _are_texts,
+    "type_names": _are_texts,
+    "effects": lambda x: x is None or _are_texts(x),
     "code": lambda x: x is None or isinstance(x, (list, dict, str)),
 }
 NEEDED = ("declared", "recipe")
-
-
-def _is_text(found: Any) -> bool:
-    return isinstance(found, str)
 
 
 def damaged(file: h5py.File, what: str) -> InputError:

@@ -8,7 +8,6 @@ given. For figures of your own, `draw_cells` and `draw_signal` draw on matplotli
 `colour_bar` and `scale_bar` add the legends.
 """
 
-from torchfilm.pictures.colours import Scale
 from torchfilm.pictures.draw import colour_bar, draw_cells, draw_signal, scale_bar
 from torchfilm.pictures.figures import show, strip
 from torchfilm.pictures.frames import Frame, frame_of
@@ -17,6 +16,7 @@ from torchfilm.pictures.micrograph import overlay
 from torchfilm.pictures.movies import movie
 from torchfilm.pictures.picture import Picture, new_figure
 from torchfilm.pictures.place_and_time import kymograph
+from torchfilm.pictures.scales import Scale
 from torchfilm.pictures.shapes import VIEWS, outlines
 from torchfilm.pictures.time_course import time_course
 

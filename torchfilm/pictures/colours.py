@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from torchfilm.pictures.categories import KINDS, MOST_TYPES, colours_of_kinds
 from torchfilm.pictures.frames import FOUNDER, OF_FILES, Frame, unit_of
+from torchfilm.pictures.scales import Beyond, Scale, ValueRange, wide_enough
 from torchfilm.pictures.shapes import VIEWS
 from torchfilm.state import OUTSIDE
 from torchfilm.tools import checks
@@ -35,9 +36,6 @@ NARROWEST = 0.01
 # The least of the range of logarithmic colours that is not given, relative to the largest value.
 FAINTEST = 1e-4
 
-RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-Beyond = Literal["neither", "both", "min", "max"]
 Limits = Mapping[str, tuple[float, float]]
 # Colours that no state has.
 NOT_OF_STATES = "It is a colour of a results file: a state does not know the lines of descent."
@@ -250,87 +248,6 @@ def values_of(cells: Mapping[str, np.ndarray], name: str, view: str) -> np.ndarr
     )
 
 
-@dataclass
-class ValueRange:
-    """The range of one quantity so far: lowest and highest value.
-
-    least: the lowest above 0. kinds: the distinct values while they are integers and at most
-    `most`, else None.
-    """
-
-    most: int = len(KINDS)
-    low: float = math.inf
-    high: float = -math.inf
-    least: float = math.inf
-    kinds: set[int] | None = field(default_factory=set)
-
-    def add(self, values: np.ndarray) -> None:
-        """Extend the range by these values."""
-        if self.kinds is not None:
-            whole = values.dtype == bool or np.issubdtype(values.dtype, np.integer)
-            self.kinds = (
-                self.kinds | {int(x) for x in np.unique(values)[: self.most + 1]} if whole else None
-            )
-            if self.kinds is not None and len(self.kinds) > self.most:
-                self.kinds = None
-        finite = values[np.isfinite(values)]
-        if finite.size:
-            self.low, self.high = (
-                min(self.low, float(finite.min())),
-                max(self.high, float(finite.max())),
-            )
-        if (above := finite[finite > 0]).size:
-            self.least = min(self.least, float(above.min()))
-
-
-@dataclass(frozen=True, eq=False)
-class Scale:
-    """The colours of a quantity.
-
-    name: of the quantity. label, unit: for a legend. cmap: the colour map. limits: the range of the
-    map. beyond: whether values lie outside the limits ("min", "max", "both" or "neither"). kinds:
-    the values of a categorical quantity, instead of a range. log: whether the colours follow the
-    logarithm of values; those of 0 and below are beyond the lower end.
-    """
-
-    name: str
-    label: str
-    unit: str
-    cmap: Any
-    limits: tuple[float, float]
-    beyond: Beyond = "neither"
-    kinds: tuple[int, ...] = ()
-    log: bool = False
-
-    @property
-    def power(self) -> int:
-        """The power of ten that a legend factors out of very small and very large numbers."""
-        power = 0 if self.kinds or self.log else math.floor(math.log10(max(map(abs, self.limits))))
-        return power if power < -2 or power > 3 else 0
-
-    @property
-    def title(self) -> str:
-        """Name and unit, for a legend."""
-        ten = "10" + str(self.power).translate(RAISED) if self.power else ""
-        unit = f"{ten} {self.unit}".strip()
-        return f"{self.label} ({unit})" if unit else self.label
-
-    def level(self, values: np.ndarray) -> np.ndarray:
-        """The position of values in the range, 0 … 1; NaN stays NaN."""
-        values, limits = np.asarray(values, dtype=float), np.asarray(self.limits)
-        if self.log:
-            limits = np.log10(limits)
-            values = np.log10(np.maximum(values, self.limits[0]))  # NaN stays NaN
-        low, high = limits
-        return np.clip((values - low) / (high - low), 0.0, 1.0)
-
-    def paint(self, values: np.ndarray) -> np.ndarray:
-        """Colours (…, 4) of values."""
-        if self.kinds:
-            return self.cmap(np.searchsorted(self.kinds, values))
-        return self.cmap(np.ma.masked_invalid(self.level(values)))
-
-
 def scale_of(
     name: str, seen: ValueRange, style: PlotStyle, units: Mapping[str, str], note: str = ""
 ) -> Scale:
@@ -359,7 +276,7 @@ def scale_of(
         low = max(least, FAINTEST * high)
     elif style.channels is not None and name != style.signal:
         low = min(0.0, low)  # a dark channel means a value of 0
-    limits = given or _wide_enough(low, high, NARROWEST if is_concentration(unit) else 0.0)
+    limits = given or wide_enough(low, high, NARROWEST if is_concentration(unit) else 0.0)
     under, over = seen.low < limits[0], seen.high > limits[1]
     beyond: Beyond = "both" if under and over else "min" if under else "max" if over else "neither"
     return Scale(name, label, unit, _colour_map(name, style), limits, beyond, log=log)
@@ -368,18 +285,6 @@ def scale_of(
 def range_of(name: str) -> ValueRange:
     """The range of a quantity of which nothing is known yet."""
     return ValueRange(MOST_TYPES if name == TYPES else len(KINDS))
-
-
-def _wide_enough(low: float, high: float, share: float) -> tuple[float, float]:
-    """The range, or one of this share of the largest value around values that differ less: the
-    errors of solvers are no pattern."""
-    if low == high:  # in the middle of the range, since it is neither low nor high
-        return (low - 0.5 * abs(low), low + 0.5 * abs(low)) if low else (0.0, 1.0)
-    least = share * max(abs(low), abs(high))
-    if high - low >= least:
-        return low, high
-    middle = 0.5 * (low + high)
-    return middle - 0.5 * least, middle + 0.5 * least
 
 
 def _colour_map(name: str, style: PlotStyle) -> Any:

@@ -13,14 +13,13 @@ from torchfilm.pictures.colours import (
     CELLS,
     MEAN,
     PlotStyle,
-    Scale,
-    ValueRange,
     is_rgb,
     paint_cells,
     range_of,
     scale_of,
     values_of,
 )
+from torchfilm.pictures.scales import Scale, ValueRange
 from torchfilm.pictures.shapes import CAP_POINTS, VIEWS, Window, along, box, outlines, section, span
 from torchfilm.state import OUTSIDE
 from torchfilm.tools import checks
@@ -350,7 +349,7 @@ def colour_bar(ax: Axes, scale: Scale) -> None:
     if scale.kinds:
         count = len(scale.kinds)
         norm: Any = BoundaryNorm(np.arange(count + 1) - 0.5, count)
-        ticks, words = np.arange(count), [str(k) for k in scale.kinds]
+        ticks, words = np.arange(count), scale.words
     elif scale.log:
         low, high = scale.limits
         norm, ticks = LogNorm(low, high), np.array([low, math.sqrt(low * high), high])
@@ -368,6 +367,8 @@ def colour_bar(ax: Axes, scale: Scale) -> None:
         extendfrac=0.06,
     )
     bar.set_ticks(list(ticks), labels=words)
+    for label in ax.get_xticklabels():
+        label.set_parse_math(False)  # names may hold a $
     bar.minorticks_off()
     bar.outline.set_linewidth(0.4)
     ax.tick_params(labelsize=TINY, length=2, width=0.4, pad=1.5)

@@ -41,7 +41,7 @@ class Frame:
     do not list. names: of the colonies, (B,), for titles; by default their ids. solid: where the
     obstacles of a medium are, one array (nx, ny, nz) bool per colony; empty without them.
     if_asked: what colours cells besides their quantities, and is worked out only where it is asked
-    for: of a state `volume`.
+    for: of a state `volume`. type_names: of the cells' types 0, 1, …, as far as they have some.
     """
 
     cells: Mapping[str, np.ndarray]
@@ -59,6 +59,7 @@ class Frame:
     names: Sequence[str] | None = None
     solid: Sequence[np.ndarray] = ()
     if_asked: Collection[str] = (VOLUME,)
+    type_names: Sequence[str] = ()
 
     def asked(self, names: Collection[str]) -> Frame:
         """The frame, with the volumes of its cells where they are among `names`."""
@@ -126,24 +127,23 @@ def frame_of(state: State, scene: Scene | None = None) -> Frame:
     walls = [] if scene is None else walls_of(scene)
     faces = {} if state.space is None else state.space.faces
     internal = [f.name for f in state.declared.values() if f.internal]
+    names = () if scene is None else scene.type_names
+    bare = Frame(
+        cells, state.time, ids, units, walls=walls, faces=faces, internal=internal,
+        type_names=names,
+    )  # fmt: skip
     if state.layout is None:
-        return Frame(cells, state.time, ids, units, walls=walls, faces=faces, internal=internal)
+        return bare
     grid = state.layout.grid
     shapes, mask = grid.shape.cpu().numpy(), state.layout.mask
     signals = {n: _parted(v.detach().cpu().numpy(), shapes) for n, v in state.signals.items()}
-    return Frame(
-        cells,
-        state.time,
-        ids,
-        units,
-        signals,
-        grid.origin.cpu().numpy(),
-        grid.shape.cpu().numpy(),
-        np.asarray(grid.spacing),
-        state.layout.height,
-        walls,
-        faces,
-        internal,
+    return replace(
+        bare,
+        signals=signals,
+        origin=grid.origin.cpu().numpy(),
+        shape=shapes,
+        spacing=np.asarray(grid.spacing),
+        height=state.layout.height,
         solid=() if mask is None else _parted(~mask.cpu().numpy(), shapes),
     )
 
@@ -189,41 +189,33 @@ class RecordedFrames(Sequence[Frame]):
         cells, ids, time = results.frame(place), results.colony_id, float(results.times[place])
         if wanted := [n for n in OF_FILES if n in self.asked and n not in cells]:
             cells = {**cells, **of_lineage(self._lineage, ids, cells, time, wanted)}
-        if_asked = (VOLUME, *OF_FILES)
-        if not results.signal_names:
-            frame = Frame(
-                cells,
-                time,
-                ids,
-                self.units,
-                walls=self.walls,
-                faces=self.faces,
-                internal=results.internal_fields,
-                names=_named(results.parameters(place)),
-                if_asked=if_asked,
-            )
-            return frame.asked(self.asked)
-        origin, shape, spacing = results.grid(place)
-        signals = {} if self.signal is None else {self.signal: results.signal(self.signal, place)}
-        height = results.attributes.get("height")
         frame = Frame(
             cells,
             time,
             ids,
             self.units,
-            signals,
-            origin,
-            shape,
-            spacing,
-            None if height is None else float(height),
-            self.walls,
-            self.faces,
-            results.internal_fields,
-            _named(results.parameters(place)),
-            _solid(self._obstacles, shape),
-            if_asked,
+            walls=self.walls,
+            faces=self.faces,
+            internal=results.internal_fields,
+            names=_named(results.parameters(place)),
+            if_asked=(VOLUME, *OF_FILES),
+            type_names=results.type_names,
+        ).asked(self.asked)
+        if not results.signal_names:
+            return frame
+        origin, shape, spacing = results.grid(place)
+        height = results.attributes.get("height")
+        return replace(
+            frame,
+            signals=(
+                {} if self.signal is None else {self.signal: results.signal(self.signal, place)}
+            ),
+            origin=origin,
+            shape=shape,
+            spacing=spacing,
+            height=None if height is None else float(height),
+            solid=_solid(self._obstacles, shape),
         )
-        return frame.asked(self.asked)
 
     @cached_property
     def _lineage(self) -> Lineage:

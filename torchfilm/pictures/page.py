@@ -14,8 +14,8 @@ import numpy as np
 from torchfilm.pictures.colours import (
     CELLS,
     MEAN,
+    TYPES,
     PlotStyle,
-    Scale,
     default_colour,
     is_rgb,
     range_of,
@@ -33,6 +33,7 @@ from torchfilm.pictures.draw import (
     set_window,
 )
 from torchfilm.pictures.frames import Frame
+from torchfilm.pictures.scales import Scale
 from torchfilm.pictures.shapes import Window, along, box, span, span_of_faces, window, with_images
 from torchfilm.tools import checks
 from torchfilm.tools.whole_files import written_whole
@@ -119,7 +120,7 @@ def plan_layout(frames: Sequence[Frame], places: Sequence[int], style: PlotStyle
             if style.signal is not None:
                 seen[style.signal].add(signal_section(frame, place, style, cells))
     scaled = [name for name in style.quantities if name not in coloured]
-    scales = tuple(scale_of(name, seen[name], style, frame.units) for name in scaled)
+    scales = tuple(_named(scale_of(n, seen[n], style, frame.units), frame) for n in scaled)
     behind = (
         None
         if style.signal is None
@@ -128,6 +129,14 @@ def plan_layout(frames: Sequence[Frame], places: Sequence[int], style: PlotStyle
     if any(frame.walls for frame in frames):
         covered = _together(covered)
     return PanelLayout(style, places, _windows(places, covered, boxes, style), scales, behind)
+
+
+def _named(scale: Scale, frame: Frame) -> Scale:
+    """The scale of types with their names, where these fit on a page."""
+    if scale.name != TYPES or not scale.kinds:
+        return scale
+    named = replace(scale, names=frame.type_names)
+    return named if _slot(named) <= WIDTH - 2 * EDGE else scale
 
 
 def _union(a: np.ndarray | None, b: np.ndarray) -> np.ndarray:
@@ -339,7 +348,9 @@ def _lines(title: str, width: float) -> list[str]:
 
 def _slot(scale: Scale) -> float:
     """The width that a legend takes, inches."""
-    return max(1.0, LETTER * len(scale.title) - 0.1, 0.2 * len(scale.kinds)) + ROOM
+    longest = max(map(len, scale.words), default=0)
+    kinds = max(0.2, LETTER * longest + 0.02) * len(scale.kinds)
+    return max(1.0, LETTER * len(scale.title) - 0.1, kinds) + ROOM
 
 
 def _legend(

@@ -13,11 +13,12 @@ import torch
 from torchfilm.io.blocks import blocks
 from torchfilm.io.identity import declared_fields
 from torchfilm.io.results import Results
-from torchfilm.pictures.colours import MEAN, PlotStyle, Scale, ValueRange, checked_range, scale_of
+from torchfilm.pictures.colours import MEAN, PlotStyle, checked_range, scale_of
 from torchfilm.pictures.figures import check_not_results, opened
 from torchfilm.pictures.frames import AGES, VOLUME, of_lineage, unit_of, volumes
 from torchfilm.pictures.page import checked_dpi
 from torchfilm.pictures.picture import Picture, new_figure
+from torchfilm.pictures.scales import Scale, ValueRange
 from torchfilm.spatial import binned_mean, checked_edges
 from torchfilm.state import OUTSIDE
 from torchfilm.tools import checks

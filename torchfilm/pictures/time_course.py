@@ -92,7 +92,7 @@ def time_course(
         ends = results.times[[0, -1]]  # of the run, also where its last cell died before
         axes[-1].set_xlim(*(ends + 0.05 * np.diff(ends) * [-1, 1]))
         if len(results.colony_id) > 1 or by is not None:
-            axes[0].legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+            _legend(axes[0])
         figure.suptitle(f"{frames.title}{more}", fontsize=9, parse_math=False)
         return Picture(figure, out)
 
@@ -175,9 +175,10 @@ def _lines(
     if len(places) > len(STYLES):
         rule = f"up to {len(STYLES)} colonies where cells are told apart by {by!r}"
         raise checks.input_error("colonies", [name(p) for p in places], rule)
-    several = len(frames[0].counts) > 1
+    several, own = len(frames[0].counts) > 1, frames[0].type_names if by == TYPES else ()
+    kind_name = {k: own[k] if 0 <= k < len(own) else f"{by} {k}" for k in kinds}
     return [
-        CourseLine(p, kind, f"{name(p)}, {by} {kind}" if several else f"{by} {kind}", c, style)
+        CourseLine(p, kind, f"{name(p)}, " * several + kind_name[kind], c, style)
         for p, style in zip(places, STYLES, strict=False)
         for kind, c in zip(kinds, _colours_of(kinds, by), strict=True)
     ]
@@ -219,6 +220,13 @@ def _colours(count: int) -> list[Any]:
     if count <= len(KINDS):
         return list(KINDS[:count])
     return [colormaps["viridis"](k / (count - 1)) for k in range(count)]
+
+
+def _legend(ax: Axes) -> None:
+    """Name the lines, beside the first panel."""
+    made = ax.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    for text in made.get_texts():
+        text.set_parse_math(False)  # names may hold a $
 
 
 def _finish(ax: Axes, label: str, scale: str) -> None:

@@ -144,6 +144,7 @@ def boundary_detector(
             flow=None if isinstance(flow, (int, float)) and flow == 0 else (flow, 0.0, 0.0),
         ),
         founders=Cells([[-1.5, 0.0], [1.5, 0.0]], [[1.0, 0.0], [1.0, 0.0]], cell_type=[0, 1]),
+        type_names=("source", "sink"),
     )
 
 
