@@ -51,6 +51,7 @@ ROOMS = {
             "torchfilm.cell_types",
             "torchfilm.medium_exchange",
             "torchfilm.film_shape",
+            "torchfilm.colony_edge",
             "torchfilm.spatial",
             "torchfilm.rule_values",
             "torchfilm.rule_draws",

@@ -136,7 +136,7 @@ def test_neighbours_within_no_such_gap_are_refused(gap):
         "overlaps", "colony_centre", "colony_radius", "depth", "nematic_order", "tilt",
         "neighbours", "wall_forces", "growth_rates", "strains", "heterozygosity",
         "pressure", "clusters", "alike_neighbours", "film", "displacement",
-        "below_top", "profile", "correlation",
+        "below_top", "below_edge", "outline", "profile", "correlation",
     ],
 )  # fmt: skip
 def test_a_measure_of_no_state_is_refused(name):

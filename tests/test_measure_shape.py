@@ -155,3 +155,34 @@ def test_the_radius_of_a_colony_counts_cells_by_their_volume():
     square = (volume * (np.array([0.0, 6.0]) - centre) ** 2).sum() / volume.sum()
     found = tf.measure.colony_radius(state)
     assert found.tolist() == pytest.approx([math.sqrt(2 * square)], rel=1e-12)
+
+
+def disc(radius, count, seed=0):
+    """Cells of all directions, evenly in a disc."""
+    random = np.random.default_rng(seed)
+    r, way = radius * np.sqrt(random.random(count)), 2 * np.pi * random.random((2, count))
+    places = np.stack([r * np.cos(way[0]), r * np.sin(way[0])], 1) + [3.0, -2.0]
+    axes = np.stack([np.cos(way[1]), np.sin(way[1])], 1)
+    return tf.Scene(tf.Mechanics(dim=2), founders=tf.Cells(places, axes, 2.0)).bind().start()
+
+
+@pytest.mark.filterwarnings("ignore:.*deep in one another")
+def test_the_edge_of_a_disc_is_its_circle():
+    """The moments of rods reach a little beyond the disc in which their centres lie."""
+    state = disc(20.0, 4000)
+    found = tf.measure.outline(state)
+    assert found.centre[0].tolist() == pytest.approx([3.0, -2.0], abs=0.5)
+    assert found.half_axes[0].tolist() == pytest.approx([20.0, 20.0], rel=0.03)
+    away = (state.position - found.centre).norm(dim=1)
+    radius = found.half_axes.mean()
+    assert torch.allclose(tf.measure.below_edge(state), radius - away, atol=0.4)
+    edges = [0.0, 5.0, 10.0, 15.0]
+    depth = tf.measure.profile(state, tf.measure.below_edge(state), edges, along="edge")
+    assert depth[0].tolist() == pytest.approx([2.4, 7.3, 12.2], abs=0.3)
+
+
+def test_an_edge_in_a_periodic_space_is_refused():
+    scene = tf.Scene(tf.Mechanics(dim=2, periodic={"x": (0.0, 40.0)}))
+    for measure in (tf.measure.outline, tf.measure.below_edge):
+        with pytest.raises(tf.InputError, match=f"{measure.__name__} .*periodic along x or y"):
+            measure(scene.bind().start())

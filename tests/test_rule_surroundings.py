@@ -68,6 +68,9 @@ def test_places_and_depth_are_those_of_measures(state):
     found = cells.below_top(0.5, floor=-3.0, across=across)
     assert found.dtype == state.dtype
     torch.testing.assert_close(found, below.to(found))
+    below = cells.below_edge()
+    assert below.dtype == state.dtype
+    torch.testing.assert_close(below, tf.measure.below_edge(state).to(below))
     one = next(iter(cells))
     assert one.x == state.position[0, 0]
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from torchfilm.colony_edge import below_edge_of
 from torchfilm.film_shape import below_top_of
 from torchfilm.physics.nearby import pairs_within
 from torchfilm.rule_values import real_column
@@ -95,3 +96,10 @@ class SurroundingsView:
         with torch.no_grad():
             found = below_top_of(self._state, spacing, floor, across)
         return found.to(self._state.dtype)
+
+    @one_torch_thread()
+    def below_edge(self) -> Tensor:
+        """How far each cell lies below the edge of its colony, seen from above, (N,) µm; negative
+        beyond it. See `measure.below_edge`."""
+        self._read.update(("cells", "position", "axis", "length", "radius"))
+        return below_edge_of(self._state).to(self._state.dtype)

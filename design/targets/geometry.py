@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.outline import below_edge, draw_below_edge
 from torchfilm import checks
 
 if TYPE_CHECKING:
@@ -23,6 +22,7 @@ Centre = Literal["colony"] | tuple[float, float]
 ALONG = ("x", "y", "z", "radius", "edge", "top")
 COLOURS = ("#c2185b", "#1976d2", "#388e3c", "#f57c00", "#7b1fa2", "#5d4037")  # of the species
 
+GRID = 121  # points a side, on which a line below the edge is drawn
 PIXEL, MOST_PIXELS = 0.25, 500  # of an outline: a side, µm, at least; and how many
 
 
@@ -105,7 +105,7 @@ def coordinate(state: tf.State, along: str, centre: Centre) -> Tensor:
     """The coordinate of each cell along "x", "y" or "radius", from the centre, its "z", or how far
     it lies below the "edge" of its colony or the "top" of its film, (N,) float64 µm."""
     if along == "edge":
-        return below_edge(state)
+        return tf.measure.below_edge(state)
     if along == "top":
         return tf.measure.below_top(state)
     if along == "z":
@@ -166,6 +166,26 @@ def draw_edges(
         draw_below_top(ax, state, place, edges, colour, style)
     elif along not in ("z", "top"):
         lines(ax, along, centre_at(state, centre, place), edges, colour, style)
+
+
+def draw_below_edge(
+    ax: Axes, state: tf.State, place: int, depths: tuple[float, ...], colour: str, style: str
+) -> None:
+    """Draw the lines at some depths, µm, below the edge of the colony at `place` of the batch, and
+    keep the limits of the axes."""
+    window = ax.get_xlim(), ax.get_ylim()
+    found = tf.measure.outline(state)
+    (x, y), reach = found.centre[place].tolist(), 1.1 * float(found.half_axes[place, 0])
+    reach += max((-d for d in depths if math.isfinite(d)), default=0.0)
+    side = torch.linspace(-reach, reach, GRID, dtype=torch.float64)
+    places = torch.cartesian_prod(x + side, y + side).to(found.centre.device)
+    depth = found.below_edge(places, torch.full_like(places[:, 0], place, dtype=torch.int64))
+    there = [d for d in sorted(depths) if math.isfinite(d) and d < float(depth.max())]
+    if there:
+        height = depth.cpu().reshape(GRID, GRID).T.numpy()
+        grid = (x + side).numpy(), (y + side).numpy()
+        ax.contour(*grid, height, there, colors=colour, linestyles=style, linewidths=1.0, zorder=3)
+    ax.set(xlim=window[0], ylim=window[1])
 
 
 def draw_below_top(

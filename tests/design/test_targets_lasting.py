@@ -24,7 +24,6 @@ from design import (
     Search,
     Weighted,
 )
-from design.targets.outline import Ellipses, below_edge, ellipses
 
 
 def filled(a: float, b: float, angle: float = 0.0, at=(0.0, 0.0), dim=2) -> tf.State:
@@ -41,7 +40,7 @@ def filled(a: float, b: float, angle: float = 0.0, at=(0.0, 0.0), dim=2) -> tf.S
 def test_the_outline_of_a_filled_ellipse_is_its_edge(a, b, dim):
     """To 2 %: the grid has steps of 0.4 µm, and balls of 0.5 µm add r²/4 to a²/4."""
     state = filled(a, b, 0.7, at=(5.0, -3.0), dim=dim)
-    found = ellipses(state)
+    found = tf.measure.outline(state)
     assert found.half_axes[0].tolist() == pytest.approx([a, b], rel=0.02)
     assert found.centre[0].tolist() == pytest.approx([5.0, -3.0], abs=0.2)
     if a > b:
@@ -54,7 +53,8 @@ def test_the_outline_of_a_filled_ellipse_is_its_edge(a, b, dim):
 @pytest.mark.parametrize("a, b", [(10.0, 10.0), (15.0, 9.0), (12.0, 4.0)])
 def test_the_distance_from_an_ellipse_is_that_of_its_nearest_point(a, b):
     """Against the nearest of 20,000 points of the edge, which lie 0.004 µm apart at most."""
-    ellipse = Ellipses(*(torch.tensor([v]).double() for v in ((1.0, 2.0), (a, b), (0.6, 0.8))))
+    given = (torch.tensor([v]).double() for v in ((1.0, 2.0), (a, b), (0.6, 0.8)))
+    ellipse = tf.measure.Outline(*given)
     place = torch.rand(300, 2, generator=torch.Generator().manual_seed(0)).double() * 30 - 14
     angle = torch.linspace(0, 2 * math.pi, 20_000, dtype=torch.float64)
     edge = torch.stack([a * angle.cos(), b * angle.sin()], 1) @ torch.tensor(
@@ -68,12 +68,12 @@ def test_the_distance_from_an_ellipse_is_that_of_its_nearest_point(a, b):
 def test_the_distance_below_the_edge_of_a_disc_is_radius_minus_distance():
     state = filled(12.0, 12.0)
     distance = state.position.norm(dim=1)
-    assert torch.allclose(below_edge(state), 12.0 - distance, atol=0.3)
+    assert torch.allclose(tf.measure.below_edge(state), 12.0 - distance, atol=0.3)
 
 
 @pytest.mark.parametrize("places", [[[3.0, 1.0]], [[0.0, 0.0], [2.0, 0.0]]])
 def test_colonies_of_one_cell_or_in_a_row_have_an_edge(places):
-    found = below_edge(placed(places, yfp=1.0))
+    found = tf.measure.below_edge(placed(places, yfp=1.0))
     assert bool(torch.isfinite(found).all()) and float(found.max()) > 0
 
 
@@ -84,7 +84,7 @@ def test_a_band_below_the_edge_moves_with_the_edge():
     target = Bands(("yfp",), (2.0, 4.0), along="edge", edge_width=SHARP)
     for radius in (8.0, 16.0):
         state = filled(radius, radius)
-        depth = below_edge(state)
+        depth = tf.measure.below_edge(state)
         lit = ((depth > 2) & (depth < 4)).double()
         assert float(target.loss(state.with_fields(yfp=lit))) < 2e-3
         assert float(target.loss(state)) == pytest.approx(1 - float(lit.mean()), abs=2e-3)
@@ -94,9 +94,10 @@ def test_a_band_below_the_edge_moves_with_the_edge():
 
 def test_the_edge_of_a_colony_does_not_depend_on_its_batch():
     state = crowded()
-    whole = below_edge(state)
+    whole = tf.measure.below_edge(state)
     for k in range(4):
-        assert torch.equal(below_edge(state.select(torch.tensor([k]))), whole[state.colony == k])
+        own = tf.measure.below_edge(state.select(torch.tensor([k])))
+        assert torch.equal(own, whole[state.colony == k])
     assert graded(Bands(("yfp",), (1.0, 3.0), along="edge"), state)
 
 
@@ -192,7 +193,7 @@ def test_the_drawn_edges_lie_below_the_edge_of_their_colony():
 
 
 def test_the_middle_of_a_circle_lies_a_radius_below_its_edge():
-    circle = Ellipses(*torch.tensor([[[0.0, 0.0]], [[5.0, 5.0]], [[1.0, 0.0]]]).double())
+    circle = tf.measure.Outline(*torch.tensor([[[0.0, 0.0]], [[5.0, 5.0]], [[1.0, 0.0]]]).double())
     places = torch.tensor([[0.0, 0.0], [0.0, 3.0], [6.0, 0.0]]).double()
     found = circle.below_edge(places, torch.zeros(3, dtype=torch.int64))
     assert found.tolist() == pytest.approx([5.0, 2.0, -1.0])

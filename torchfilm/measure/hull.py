@@ -10,8 +10,8 @@ import torch
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
+from torchfilm.colony_edge import check_flat_space
 from torchfilm.measure.of_a_state import of_a_state
-from torchfilm.measure.shape import check_flat_space
 from torchfilm.state import State
 
 CORNERS = 64  # of a disc, where cells differ in their radius

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from torchfilm.colony_edge import Outline, below_edge_of, check_flat_space, outline_of
 from torchfilm.film_shape import Film, below_top_of, film_of
 from torchfilm.measure.of_a_state import of_a_state
 from torchfilm.micrographs.capsule_fit import moments_of_capsule
@@ -35,13 +36,6 @@ def colony_radius(state: State) -> Tensor:
     sums = state.groups.sum(torch.stack([square, volume], 1))
     mean = 2.0 * sums[:, 0] / sums[:, 1]
     return torch.where(state.counts == 0, torch.nan, safe_sqrt(mean))
-
-
-def check_flat_space(measure: str, state: State) -> None:
-    """Raise InputError where a colony may go on beyond a face along x or y."""
-    if state.space is not None and {"x", "y"} & {*state.space.faces}:
-        text = f"{measure} goes by places, and this space is periodic along x or y."
-        raise checks.InputError(text)
 
 
 @of_a_state
@@ -116,6 +110,23 @@ def below_top(
     The parameters are those of `film`."""
     spacing = checks.number("below_top(spacing)", spacing, above=0.0)
     return below_top_of(state, spacing, checks.number("below_top(floor)", floor), across)
+
+
+@of_a_state
+def outline(state: State) -> Outline:
+    """The edge of each colony as seen from above: the ellipse with the second moments of its cells,
+    caps included, which count by their volume. `outline.below_edge(places, colony)` is how far
+    places lie below it. Raises InputError in a space that is periodic along x or y."""
+    return outline_of("outline", state)
+
+
+@of_a_state
+def below_edge(state: State) -> Tensor:
+    """How far the centre of each cell lies below the edge of its colony as seen from above, (N,)
+    float64 µm: its distance to the nearest point of the `outline`, negative beyond it. In a colony
+    that is far from an ellipse, as between walls, an edge by height does: `below_top`. Raises
+    InputError in a space that is periodic along x or y."""
+    return below_edge_of(state)
 
 
 @of_a_state

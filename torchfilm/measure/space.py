@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.measure.of_a_state import of_a_state
-from torchfilm.measure.shape import below_top, colony_centre
+from torchfilm.measure.shape import below_edge, below_top, colony_centre
 from torchfilm.physics.nearby import pairs_within
 from torchfilm.spatial import EQUAL, binned_mean, checked_edges, pair_correlation, quantity
 from torchfilm.state import State
@@ -25,8 +25,8 @@ def profile(
 
     name: a field of the cells, a signal at them as "out.NAME", or numbers, (N,). edges: of the
     bins, K + 1 of them, µm, ascending; a bin has its lower edge, not its upper one. along: "x",
-    "y", "z", "radius" from the colony's centre (of volume) in the x–y plane, "top" as `below_top`
-    has it, or a coordinate of your own, (N,)."""
+    "y", "z", "radius" from the colony's centre (of volume) in the x–y plane, "edge" as
+    `below_edge` and "top" as `below_top` have it, or a coordinate of your own, (N,)."""
     value, limits = quantity("profile", state, name), checked_edges("profile", edges)
     return binned_mean(state.groups, value, place_along("profile", state, along), limits)
 
@@ -35,9 +35,11 @@ def place_along(measure: str, state: State, along: str | Tensor) -> Tensor:
     """The coordinate of each cell, (N,) µm, as `profile` has it."""
     if isinstance(along, Tensor):
         return quantity(measure, state, along)
-    checks.choice(f"{measure}(along)", along, (*"xyz"[: state.dim], "radius", "top"))
+    checks.choice(f"{measure}(along)", along, (*"xyz"[: state.dim], "radius", "edge", "top"))
+    if along in ("edge", "top"):
+        return below_edge(state) if along == "edge" else below_top(state)
     if along != "radius":
-        return below_top(state) if along == "top" else state.position[:, "xyz".index(along)]
+        return state.position[:, "xyz".index(along)]
     apart = state.position - colony_centre(state).index_select(0, state.colony)
     return safe_norm(apart[:, :2].double().T)
 

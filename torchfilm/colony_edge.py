@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-import torchfilm as tf
-from design.targets.base import total, weights
+from torchfilm.state import State
+from torchfilm.tools import checks
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-GRID = 121  # points a side, on which a line below the edge is drawn
 ITERATIONS = 4  # to the nearest point of an ellipse: to 0.005 µm where it is 12 µm by 4
 
 
 @dataclass(frozen=True)
-class Ellipses:
-    """The outlines of B colonies, float64 without gradient: centre (B, 2) µm, half_axes (B, 2) µm,
-    the longer first, and its direction (B, 2)."""
+class Outline:
+    """The edges of B colonies seen from above, as ellipses, float64 without gradient; NaN without
+    cells.
+
+    centre: (B, 2) µm. half_axes: (B, 2) µm, the longer first. direction: of the longer, (B, 2)."""
 
     centre: Tensor
     half_axes: Tensor
@@ -66,22 +62,32 @@ def _length(x: Tensor, y: Tensor) -> Tensor:
     return (x * x + y * y).sqrt()
 
 
-def ellipses(state: tf.State) -> Ellipses:
-    """The colonies seen from above.
+def check_flat_space(measure: str, state: State) -> None:
+    """Raise InputError where a colony may go on beyond a face along x or y."""
+    if state.space is not None and {"x", "y"} & {*state.space.faces}:
+        text = f"{measure} goes by places, and this space is periodic along x or y."
+        raise checks.InputError(text)
+
+
+@torch.no_grad()
+def outline_of(measure: str, state: State) -> Outline:
+    """See `measure.outline`. measure: the name for messages.
 
     A filled ellipse with half-axes a and b has the variances a²/4 and b²/4 of places along them.
     The covariance is that of all points of the cells, each a rod of length ℓ + 2r: that of the
     cells' centres, weighted by volume, plus (ℓ + 2r)²/12 along each cell and r²/4 across.
     """
-    w = weights(state).unsqueeze(1)
-    centre = tf.measure.colony_centre(state)[:, :2].detach()
-    x = state.position.detach()[:, :2] - centre.index_select(0, state.colony)
-    axis, radius = state.axis.detach()[:, :2].double(), state.radius.detach().double()
-    along = (state.length.detach().double() + 2 * radius).square() / 12 - radius.square() / 4
+    check_flat_space(measure, state)
+    w, groups = state.volume.double().unsqueeze(1), state.groups
+    mean_of = lambda x: groups.sum(w * x) / groups.sum(w)
+    centre = mean_of(state.position[:, :2].double())
+    x = state.position[:, :2].double() - centre.index_select(0, state.colony)
+    axis, radius = state.axis[:, :2].double(), state.radius.double()
+    along = (state.length.double() + 2 * radius).square() / 12 - radius.square() / 4
     pairs = lambda v: torch.stack([v[:, 0] * v[:, 0], v[:, 0] * v[:, 1], v[:, 1] * v[:, 1]], 1)
     each = pairs(x) + along.unsqueeze(1) * pairs(axis)
     each = each + (radius.square() / 4).unsqueeze(1) * each.new_tensor([1.0, 0.0, 1.0])
-    xx, xy, yy = (total(state, w * each) / total(state, w)).unbind(1)
+    xx, xy, yy = mean_of(each).unbind(1)
     mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
     spread = _length(half, xy)
     half_axes = 2.0 * torch.stack([mean + spread, mean - spread], 1).sqrt()
@@ -90,30 +96,10 @@ def ellipses(state: tf.State) -> Ellipses:
     v = torch.where(half >= 0, xy, spread - half)
     size = _length(u, v)
     direction = torch.stack([torch.where(size > 0, u, 1.0), v], 1)
-    return Ellipses(centre, half_axes, direction / torch.where(size > 0, size, 1.0).unsqueeze(1))
+    return Outline(centre, half_axes, direction / torch.where(size > 0, size, 1.0).unsqueeze(1))
 
 
-def below_edge(state: tf.State) -> Tensor:
-    """How far each cell lies below the edge of its colony, (N,) float64 µm; negative beyond the
-    edge."""
-    return ellipses(state).below_edge(state.position.detach()[:, :2], state.colony)
-
-
-def draw_below_edge(
-    ax: Axes, state: tf.State, place: int, depths: tuple[float, ...], colour: str, style: str
-) -> None:
-    """Draw the lines at some depths, µm, below the edge of the colony at `place` of the batch, and
-    keep the limits of the axes."""
-    window = ax.get_xlim(), ax.get_ylim()
-    found = ellipses(state)
-    (x, y), reach = found.centre[place].tolist(), 1.1 * float(found.half_axes[place, 0])
-    reach += max((-d for d in depths if math.isfinite(d)), default=0.0)
-    side = torch.linspace(-reach, reach, GRID, dtype=torch.float64)
-    places = torch.cartesian_prod(x + side, y + side).to(found.centre.device)
-    depth = found.below_edge(places, torch.full_like(places[:, 0], place, dtype=torch.int64))
-    there = [d for d in sorted(depths) if math.isfinite(d) and d < float(depth.max())]
-    if there:
-        height = depth.cpu().reshape(GRID, GRID).T.numpy()
-        grid = (x + side).numpy(), (y + side).numpy()
-        ax.contour(*grid, height, there, colors=colour, linestyles=style, linewidths=1.0, zorder=3)
-    ax.set(xlim=window[0], ylim=window[1])
+def below_edge_of(state: State) -> Tensor:
+    """See `measure.below_edge`."""
+    found = outline_of("below_edge", state)
+    return found.below_edge(state.position.detach()[:, :2].double(), state.colony)
