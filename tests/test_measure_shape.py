@@ -161,7 +161,7 @@ def disc(radius, count, seed=0):
     """Cells of all directions, evenly in a disc."""
     random = np.random.default_rng(seed)
     r, way = radius * np.sqrt(random.random(count)), 2 * np.pi * random.random((2, count))
-    places = np.stack([r * np.cos(way[0]), r * np.sin(way[0])], 1) + [3.0, -2.0]
+    places = np.stack([3.0 + r * np.cos(way[0]), r * np.sin(way[0]) - 2.0], 1)
     axes = np.stack([np.cos(way[1]), np.sin(way[1])], 1)
     return tf.Scene(tf.Mechanics(dim=2), founders=tf.Cells(places, axes, 2.0)).bind().start()
 

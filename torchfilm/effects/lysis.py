@@ -72,9 +72,10 @@ class Lysis(Effect):
     factor: name of a species or variable that multiplies the rate.
 
     hazard: in place of `rate` and `when`, the name of a species of a circuit that adds up the rate
-    of death, such as {"dying": p.k * s.drug}. At the end of a step a cell bursts by the chance 1 −
-    exp(−dying); in those that live it begins again at 0. So cells die by what they met in the
-    whole step, also where they take up what kills them. A variable of rules serves, too.
+    of death, such as {"dying": p.k * s.drug}, and that growth does not dilute (dilution=False, or
+    the names of the others). At the end of a step a cell bursts by the chance 1 − exp(−dying); in
+    those that live it begins again at 0. So cells die by what they met in the whole step, also
+    where they take up what kills them. A variable of rules serves, too.
 
     releases: what goes to each signal of the Medium, by the signal's name: the name of a species
     (its concentration times the cell's volume is released) or of a variable of rules (its value, an
@@ -200,13 +201,25 @@ class Lysis(Effect):
     def bind(self, binding: Binding) -> tuple[BoundEffect, ...]:
         return (BoundLysis(self, binding),)
 
+    def check_scene(self, effects: Sequence[Effect], founders: Any) -> None:
+        for diluted in (getattr(other, "diluted_fields", ()) for other in effects):
+            if self.hazard in diluted:
+                others = tuple(name for name in diluted if name != self.hazard)
+                write = f"dilution={others}" if others else "dilution=False"
+                raise checks.InputError(
+                    f"Lysis.hazard = {self.hazard!r}: growth dilutes this species, so that fewer"
+                    f" cells would die than it says. Write {write} in its circuit."
+                )
+
     def check_step(self, dt: float, divides: bool) -> None:
         given = {name: value for name, (value, _) in self.physical_values().items()}
         warn_of_means("Lysis", given, dt)
 
     def check(self, state: State, values: Values) -> None:
+        options = {getattr(self, n): f"Lysis.{n}" for n in ("factor", "hazard", "when")}
         for name in self._variables():
-            check_variable("Lysis", name, state, at_least_zero=name in self.at_least_zero())
+            option = options.get(name, "Lysis.releases")
+            check_variable(option, name, state, at_least_zero=name in self.at_least_zero())
         own = None if self.hazard is None else state.declared[self.hazard]
         if own is not None and own.unit and not own.is_species:  # no species, no variable
             raise checks.input_error(
