@@ -442,3 +442,23 @@ def test_voxels_finer_than_cells_are_said(spacing, said):
     scene = tf.Scene(tf.Monod("food"), tf.Growth(), medium, founders=large, dt=0.02)
     words = "are finer than cells, of radii up to 2 µm"
     assert (words in " ".join(tf.explain(scene, seconds=0).split())) == said
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_circuits_that_share_a_signal_are_of_first_order_between_them(several):
+    def leaks(u, s, p, cell):
+        out = (u.a - s.a) * cell.area
+        return {"a": 1.0 - out / cell.volume}, {"a": out}
+
+    def eats(u, s, p, cell):
+        return {"got": s.a}, {"a": -s.a * cell.volume}
+
+    more = [tf.Circuit(eats, species="got", name="eater")] if several else []
+    scene = tf.Scene(
+        tf.Circuit(leaks, species="a"), *more,
+        tf.Medium(a=tf.Signal(diffusion=50.0), box=((-8, -8), (8, 8)), spacing=4.0, depth=1.0),
+        dim=2,
+    )  # fmt: skip
+    found = str(tf.explain(scene))
+    assert "a: transport by a series, order 2 in dt" in found
+    assert ("order 1 between them" in found) is several

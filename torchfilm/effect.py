@@ -259,12 +259,13 @@ class ExchangePlan:
     """How an effect exchanges signals with the medium, as the medium decides at binding.
 
     transport: by which the effect moves these signals itself; None: the medium moves them. turns:
-    of exchange and transport in a step. shared: signals that nutrition exchanges, too.
+    of both in a step. shared, several: signals that nutrition, and that several circuits exchange.
     """
 
     transport: Any = None
     turns: int = 1
     shared: frozenset[str] = frozenset()
+    several: frozenset[str] = frozenset()
 
 
 class BoundEffect:
@@ -287,9 +288,8 @@ class BoundEffect:
     def __init__(self, effect: Effect, binding: Binding):
         self.effect, self.binding = effect, binding
         self.title, self.stage = effect.title, effect.stage
-        self.place = 0  # of the effect in its scene
         self.by_type: tuple[str, ...] = ()  # what cells keep by their type, see `kept_by_type`
-        self.plan = ExchangePlan()
+        self.plan, self.place = ExchangePlan(), 0  # the place of the effect in its scene
         self.values = Values(self._resolve(effect, binding.batch))
 
     @staticmethod

@@ -223,16 +223,15 @@ class BoundCircuit(BoundEffect):
         return [self.by_torch] if self.by_torch else parts
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        transport = self.plan.transport  # where it is solved together with circuits
+        plan, transport = self.plan, self.plan.transport  # where both are solved together
         exchanged = () if transport else self.exchanges()
         known = [c for c in self.compiled.values() if not isinstance(c, str)]
         own = next((x for c in known if (x := c.equations.builder.own_derivative)), "")
-        lines = methods_of(self.effect, dt, self.plan.turns, self._why_torch(), exchanged, own)
+        lines = methods_of(self.effect, dt, plan.turns, self._why_torch(), exchanged, own)
         each = self.effect.parameters.items()
         lines += [f"{n} {x.told}" for n, x in each if isinstance(x, Schedule)]
         if transport:
-            pace, dt = transport.exchanges_per_hour, dt / transport.medium.steps
-            lines += together_lines({n: pace(n, state) * dt for n in self.exchanges()})
+            lines += together_lines(self.exchanges(), plan, dt, state)
         return lines
 
     def check_step(self, dt: float, divides: bool) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Collection, Container, Sequence
 from typing import TYPE_CHECKING
 
@@ -121,10 +122,12 @@ class BoundMedium(MediumPart):
         self.transport.in_turns = frozenset()
         for effect in eaters:
             effect.plan = ExchangePlan(self.transport)
+        times = Counter(n for c in circuits for n in c.exchanges())
+        several = frozenset(n for n, count in times.items() if count > 1)
         for effect in circuits:
             together = self.transport if joint and effect.exchanges() else None
             turns = self.effect.steps if given and not joint else 1
-            effect.plan = ExchangePlan(together, turns, frozenset(both))
+            effect.plan = ExchangePlan(together, turns, frozenset(both), several)
         # what acts once in a step finds its signals half way, but for a nutrient
         once = [e for e in others if e.stage < CIRCUIT]
         known = {n for e in once for n in (*e.reads(), *e.writes())}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from torchfilm.circuits.compiled_gradients import MOST_DIRECTIONS
@@ -12,7 +12,9 @@ from torchfilm.signals.joint import COARSE, LATE
 from torchfilm.values import numbers
 
 if TYPE_CHECKING:
+    from torchfilm.effect import ExchangePlan
     from torchfilm.effects.circuit import Circuit
+    from torchfilm.state import State
 
 
 def methods_of(
@@ -53,9 +55,10 @@ def methods_of(
     return lines
 
 
-def together_lines(exchanges: Mapping[str, float]) -> list[str]:
-    """Lines on signals whose transport is solved together with the circuit. exchanges: how often
-    voxels exchange each in a step."""
+def together_lines(names: Sequence[str], plan: ExchangePlan, dt: float, state: State) -> list[str]:
+    """Lines on signals whose transport is solved together with the circuit in a step of dt h."""
+    hours, pace = dt / plan.transport.medium.steps, plan.transport.exchanges_per_hour
+    exchanges = {name: pace(name, state) * hours for name in names}  # of voxels in a step
     lines = [
         f"exchange and transport of {', '.join(exchanges)} in one equation over the step; amounts"
         " kept to rounding"
@@ -68,4 +71,6 @@ def together_lines(exchanges: Mapping[str, float]) -> list[str]:
             if times > EVENTS
             else f"{name}: transport by a series, order 2 in dt"
         )
+        if name in plan.several:
+            lines[-1] += "; several circuits exchange it one after the other: order 1 between them"
     return lines
