@@ -136,3 +136,30 @@ def test_a_box_that_grows_through_a_wall_is_warned_of(walls, given, words):
 def test_faces_that_there_are_not_are_refused(grows):
     with pytest.raises(tf.InputError, match=r"Medium\.grows = .*such as \"xy\+z\""):
         tf.Medium(**FOOD, box=BOX, outside="grow", grows=grows)
+
+
+@pytest.mark.parametrize(
+    ("face", "warns"),
+    [
+        (tf.Dirichlet(1.0), True),
+        (tf.Robin(tf.Schedule({0: 0.0, 2: 1.0}), transfer=0.5), True),
+        (tf.Open(outside=[0.0, 2.0]), True),
+        (tf.Dirichlet(0.0), False),
+        (tf.NoFlux(), False),
+    ],
+)
+def test_a_value_at_a_face_for_several_signals_is_warned_of(face, warns):
+    """A film fed through its upper face: an inducer that cells make would be fed there, too."""
+    faces = tf.BoundaryConditions(y=(tf.NoFlux(), face))
+    made = lambda **more: tf.Medium(
+        food=tf.Signal(1e3), ahl=tf.Signal(1e3, **more), box=((0, 0), (8, 8)), spacing=4.0,
+        boundary=faces,
+    )  # fmt: skip
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        made()
+        made(boundary=tf.BoundaryConditions())
+    assert len(said) == warns
+    if warns:
+        assert f"{type(face).__name__} along y" in str(said[0].message)
+        assert "food and ahl" in str(said[0].message)

@@ -3,7 +3,7 @@ is."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -12,18 +12,35 @@ import torch
 from torch import Tensor
 
 from torchfilm.effects.scaled import scaled
+from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.grid import GridBatch
 from torchfilm.signals.layout import Layout
-from torchfilm.signals.schedule import ROUNDING, Schedule
+from torchfilm.signals.schedule import ROUNDING, Schedule, each_value
 from torchfilm.state import State
 from torchfilm.tools import checks, random
-from torchfilm.values import Distribution, PerColony
+from torchfilm.tools.warn_once import warn
+from torchfilm.values import Distribution, PerColony, numbers
 
 if TYPE_CHECKING:
     from torchfilm.effects.signal import Flow, OnGrid, Signal
 
 Corner = Sequence[float]
 BITS = 21  # of the number of a voxel along an axis, in its key
+
+
+def warn_of_one_value(boundary: BoundaryConditions | None, signals: Mapping[str, Signal]) -> None:
+    """Warn where a face of the medium supplies several signals with one value."""
+    several = [name for name, signal in signals.items() if signal.boundary is None]
+    if boundary is None or len(several) < 2:
+        return
+    for axis, pair in zip("xyz", boundary.pairs, strict=True):
+        for face in pair:
+            if any(bool((numbers(x) != 0).any()) for x in each_value(face.outside_value())):
+                warn(
+                    f"{type(face).__name__} along {axis} in Medium.boundary has one value for"
+                    f" {' and '.join(several)}: each has it there. Give faces to the signal that"
+                    f" they supply, {several[0]}=tf.Signal(…, boundary=…), or to each."
+                )
 
 
 def on_grid(
