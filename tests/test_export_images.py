@@ -270,6 +270,22 @@ def test_what_other_programs_read(run, tmp_path):
     assert ('TimeIncrement="' in text) == bool(np.allclose(np.diff(run.times), run.times[1]))
 
 
+def test_what_is_written_of_a_window_is_where_it_lies(run, tmp_path):
+    path = run.to_labels(
+        tmp_path / "a.ome.tif", pixel_size=0.5, colony=1, window=((-3.0, -2.0), (5.0, 4.0))
+    )
+    with tifffile.TiffFile(path) as file:
+        text, tags = file.ome_metadata, file.pages[0].tags
+        resolution, unit = tags["XResolution"].value, tags["ResolutionUnit"].value
+    places = {axis: set(re.findall(f'Position{axis}="([^"]*)"', text)) for axis in "XY"}
+    # of the centre of the first pixel, at the left of the top row
+    assert {axis: set(map(float, found)) for axis, found in places.items()} == {
+        "X": {-2.75}, "Y": {3.75},
+    }  # fmt: skip
+    assert unit == 3 and resolution[0] / resolution[1] == 20_000  # pixels per cm
+    assert 'Name="run, colony 1"' in text
+
+
 def test_bad_input_is_named(run, tmp_path):
     def light(**options):
         return run.to_ome_tiff(

@@ -155,3 +155,13 @@ def test_the_radius_of_a_colony_counts_cells_by_their_volume():
     square = (volume * (np.array([0.0, 6.0]) - centre) ** 2).sum() / volume.sum()
     found = tf.measure.colony_radius(state)
     assert found.tolist() == pytest.approx([math.sqrt(2 * square)], rel=1e-12)
+
+
+def test_the_depth_of_a_colony_is_from_its_lowest_end_to_its_highest():
+    """The ends may be those of different cells, of which the upper one stands upright."""
+    state = state_of(
+        [[0.0, 0.0, 0.0], [0.0, 0.0, 5.0], [9.0, 0.0, 7.0]],
+        [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.6, 0.8]],
+        length=[2.0, 4.0, 1.0], radius=0.5, colony=[0, 0, 1],
+    )  # fmt: skip
+    assert tf.measure.depth(state).tolist() == pytest.approx([8.0, 1.8])
