@@ -93,3 +93,12 @@ def test_colonies_are_named_by_what_their_parameter_was_then(tmp_path, medium):
         first, last = RecordedFrames(results, [0, -1])
         assert [first.name(k) for k in (0, 1)] == ["rate = 1e-09", "rate = 2e-09"]
         assert [last.name(k) for k in (0, 1)] == ["rate = 3e-09", "rate = 4e-09"]
+
+
+def test_replicates_whose_kinds_are_counted_apart_have_their_ids(tmp_path):
+    founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], cell_type=[0])
+    scene = tf.Scene(tf.Lysis(rate=[1e-9, 1e-9, 2e-9]), founders=founders, dim=2, dt=0.1)
+    start = scene.bind().start().select([2, 1, 0])
+    tf.simulate(scene, start, until=0.2, record=tmp_path / "run.h5").last()
+    lines = pictures.time_course(tmp_path / "run.h5", by="cell_type").figure
+    assert [text.split(", ")[1] for text in legend(lines)] == ["colony 2", "colony 1", "colony 0"]
