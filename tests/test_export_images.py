@@ -244,6 +244,18 @@ def test_each_channel_has_noise_of_its_own(run, tmp_path):
     assert first.size == 40000 and abs(np.corrcoef(first, second)[0, 1]) < 5 / 200
 
 
+def test_frames_and_colonies_have_noise_of_their_own(run, tmp_path):
+    """Far from cells, as above."""
+    given = {"pixel_size": 0.2, "channels": {"gfp": 1.0}, "frames": [0, -1], "noise": 5.0}
+    given |= {"background": 50.0, "window": ((50.0, 50.0), (90.0, 90.0))}
+    images = [
+        tifffile.imread(run.to_ome_tiff(tmp_path / f"{colony}.tif", colony=colony, **given))
+        for colony in (0, 1)
+    ]
+    alike = np.corrcoef(np.concatenate(images).reshape(4, -1).astype(float))
+    assert abs(alike[np.triu_indices(4, 1)]).max() < 5 / 200
+
+
 def test_noise_does_not_depend_on_what_else_is_written(run, tmp_path):
     common = {"pixel_size": 0.2, "colony": 1, "noise": 3.0, "window": ((-9, -9), (9, 9))}
     all_of_it = tifffile.imread(

@@ -17,6 +17,7 @@ from torchfilm.pictures.colours import PlotStyle
 from torchfilm.pictures.draw import add_faces, add_obstacles, add_walls
 from torchfilm.pictures.frames import _solid
 from torchfilm.pictures.page import plan_layout, signal_section, solid_section
+from torchfilm.pictures.shapes import span_of_faces, with_images
 
 
 @pytest.mark.parametrize(("view", "centre"), [("xy", (1, 2)), ("xz", (1, 3)), ("yz", (2, 3))])
@@ -89,3 +90,16 @@ def test_obstacles_of_colonies_are_their_own():
     first, second = _solid(kept, np.array([[2, 2, 1], [4, 2, 1]]))
     assert np.argwhere(first).tolist() == [[1, 0, 0]]
     assert np.argwhere(second).tolist() == [[2, 1, 0]]
+
+
+def test_images_beyond_faces_are_a_period_away_and_boxes_go_from_face_to_face():
+    cells = {
+        "position": np.array([[9.0, 0.0, 1.0]]), "axis": np.array([[1.0, 0.0, 0.0]]),
+        "length": np.array([2.0]), "radius": np.array([0.5]),
+    }  # fmt: skip
+    faces = {"x": (-10.0, 10.0)}
+    shown = with_images(cells, faces, "xz", (-12.0, 12.0, -5.0, 5.0))
+    assert shown["position"].tolist() == [[9.0, 0.0, 1.0], [-11.0, 0.0, 1.0]]
+    covered = np.array([[-1.0, -2.0], [3.0, 4.0]])
+    assert span_of_faces(faces, covered, "xz").tolist() == [[-10.0, -2.0], [10.0, 4.0]]
+    assert span_of_faces({"z": (0.0, 9.0)}, covered, "xz").tolist() == [[-1.0, 0.0], [3.0, 9.0]]
