@@ -10,10 +10,11 @@ from drawn import frame
 
 import torchfilm as tf
 from torchfilm import pictures
-from torchfilm.pictures.colours import OUTSIDE, PlotStyle
+from torchfilm.pictures.colours import PlotStyle
 from torchfilm.pictures.figures import choose_colonies
 from torchfilm.pictures.frames import RecordedFrames
 from torchfilm.pictures.page import plan_layout
+from torchfilm.state import OUTSIDE
 
 pytest.importorskip("matplotlib")
 
