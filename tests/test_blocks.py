@@ -9,6 +9,7 @@ import pytest
 
 import torchfilm as tf
 from torchfilm.io import blocks
+from torchfilm.pictures.place_and_time import known_quantities
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,3 +73,12 @@ def test_fields_of_colonies_are_columns_of_tables(run):
     assert np.array_equal(made["colony"], some.own_colony_id.numpy())
     assert np.array_equal(made["dose"], some.dose[some.colony].numpy())
     assert set(made["dose"]) == {90.0, 30.0}
+
+
+def test_ages_in_pictures_are_those_at_the_hours_of_their_frames(run, monkeypatch):
+    monkeypatch.setattr(blocks, "MOST_ROWS", 600)
+    with tf.Results(run) as results:
+        seen = [known for _, known in known_quantities(results, "age", "born")]
+        table = results.table()
+    for name in ("age", "born"):
+        assert np.array_equal(np.concatenate([known[name] for known in seen]), table[name])

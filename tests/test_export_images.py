@@ -244,6 +244,18 @@ def test_each_channel_has_noise_of_its_own(run, tmp_path):
     assert first.size == 40000 and abs(np.corrcoef(first, second)[0, 1]) < 5 / 200
 
 
+def test_frames_and_colonies_have_noise_of_their_own(run, tmp_path):
+    """Far from cells, as above."""
+    given = {"pixel_size": 0.2, "channels": {"gfp": 1.0}, "frames": [0, -1], "noise": 5.0}
+    given |= {"background": 50.0, "window": ((50.0, 50.0), (90.0, 90.0))}
+    images = [
+        tifffile.imread(run.to_ome_tiff(tmp_path / f"{colony}.tif", colony=colony, **given))
+        for colony in (0, 1)
+    ]
+    alike = np.corrcoef(np.concatenate(images).reshape(4, -1).astype(float))
+    assert abs(alike[np.triu_indices(4, 1)]).max() < 5 / 200
+
+
 def test_noise_does_not_depend_on_what_else_is_written(run, tmp_path):
     common = {"pixel_size": 0.2, "colony": 1, "noise": 3.0, "window": ((-9, -9), (9, 9))}
     all_of_it = tifffile.imread(
@@ -268,6 +280,22 @@ def test_what_other_programs_read(run, tmp_path):
     times = [float(t) for t in re.findall(r'DeltaT="([\d.e-]+)" DeltaTUnit="h"', text)]
     assert np.allclose(times, np.repeat(run.times, 2))
     assert ('TimeIncrement="' in text) == bool(np.allclose(np.diff(run.times), run.times[1]))
+
+
+def test_what_is_written_of_a_window_is_where_it_lies(run, tmp_path):
+    path = run.to_labels(
+        tmp_path / "a.ome.tif", pixel_size=0.5, colony=1, window=((-3.0, -2.0), (5.0, 4.0))
+    )
+    with tifffile.TiffFile(path) as file:
+        text, tags = file.ome_metadata, file.pages[0].tags
+        resolution, unit = tags["XResolution"].value, tags["ResolutionUnit"].value
+    places = {axis: set(re.findall(f'Position{axis}="([^"]*)"', text)) for axis in "XY"}
+    # of the centre of the first pixel, at the left of the top row
+    assert {axis: set(map(float, found)) for axis, found in places.items()} == {
+        "X": {-2.75}, "Y": {3.75},
+    }  # fmt: skip
+    assert unit == 3 and resolution[0] / resolution[1] == 20_000  # pixels per cm
+    assert 'Name="run, colony 1"' in text
 
 
 def test_bad_input_is_named(run, tmp_path):

@@ -147,6 +147,32 @@ def test_some_colonies_and_frames_as_lines(run, tmp_path):
         polydata(path, 2)
 
 
+def test_colonies_in_an_order_of_ones_own_lie_in_the_plane_of_their_medium(tmp_path):
+    """Ids are no places here: colonies 2, 0 and 1 are in the places 0, 1 and 2."""
+    cells = tf.Cells(
+        [[0.0, 0.0], [3.0, 0.0], [0.0, 3.0], [-3.0, 1.0]], [[1.0, 0.0]] * 4, 2.0,
+        colony=[0, 1, 1, 2],
+    )  # fmt: skip
+    medium = tf.Medium(m=tf.Signal(0.0), box=((-6, -6), (6, 6)), spacing=2.0, depth=2.0, height=5.0)
+    scene = tf.Scene(tf.Growth(rate=0.1), medium, founders=cells, dt=0.1)
+    path = tmp_path / "run.h5"
+    tf.simulate(scene, scene.bind().start().select([2, 0, 1]), until=0.1, record=path).last()
+    with tf.Results(path) as results:
+        shapes, _ = results.to_vtkhdf(tmp_path / "a.vtkhdf", colonies=[1, 2], rods="lines")
+        table = results.table(0)
+    with h5py.File(shapes) as file:
+        ids = file["torchfilm/colony"][...].tolist()
+        shifts = dict(zip(ids, file["torchfilm/shift"][...], strict=True))
+    found = polydata(shapes, 0)
+    middle = found["points"].reshape(-1, 2, 3).mean(1)
+    assert ids == [1, 2] and found["data"]["colony"].tolist() == [2, 1, 1]
+    assert not shifts[1].any() and shifts[2].any()
+    rows = [int(np.flatnonzero(table["colony"] == 2)[0]), *np.flatnonzero(table["colony"] == 1)]
+    for k, row in enumerate(rows):
+        place = np.array([table["x"][row], table["y"][row], 5.0])
+        assert middle[k] == pytest.approx(place + shifts[int(table["colony"][row])], abs=1e-5)
+
+
 def dying(tmp_path) -> tf.Results:
     """Colonies of which one is empty from the start, and the other in the middle: it is refilled by
     no one. The first frame has cells, later ones none."""

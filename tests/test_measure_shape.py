@@ -186,3 +186,13 @@ def test_an_edge_in_a_periodic_space_is_refused():
     for measure in (tf.measure.outline, tf.measure.below_edge):
         with pytest.raises(tf.InputError, match=f"{measure.__name__} .*periodic along x or y"):
             measure(scene.bind().start())
+
+
+def test_the_depth_of_a_colony_is_from_its_lowest_end_to_its_highest():
+    """The ends may be those of different cells, of which the upper one stands upright."""
+    state = state_of(
+        [[0.0, 0.0, 0.0], [0.0, 0.0, 5.0], [9.0, 0.0, 7.0]],
+        [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.6, 0.8]],
+        length=[2.0, 4.0, 1.0], radius=0.5, colony=[0, 0, 1],
+    )  # fmt: skip
+    assert tf.measure.depth(state).tolist() == pytest.approx([8.0, 1.8])

@@ -81,6 +81,23 @@ def test_cells_that_are_removed_before_a_run_resumes_have_an_end(tmp_path):
     assert np.allclose(tree.end_length[rows], last.length[gone].numpy())
 
 
+def test_cells_that_are_removed_before_a_resume_are_of_their_own_colony(tmp_path):
+    """Also where ids of colonies are not their places."""
+    path = tmp_path / "run.h5"
+    cells = tf.Cells([[0.0, 0.0], [9.0, 0.0]] * 3, [1.0, 0.0], 2.0, colony=[0, 0, 1, 1, 2, 2])
+    scene = tf.Scene(tf.Growth(rate=0.1), founders=cells, dim=2, dt=0.1)
+    tf.simulate(scene, scene.bind().start().select([2, 1]), until=0.2, record=path).last()
+    with tf.Results(path) as results:
+        state = results.state(scene)
+    state = state.remove((state.own_colony_id == 2) & (state.uid == 1), "removed")
+    tf.simulate(scene, state, until=0.4, record=tf.Recorder(path, scene, append=True)).last()
+    with tf.Results(path) as results:
+        tree = results.lineage()
+    gone = tree.fate == "removed"
+    assert list(zip(tree.colony[gone], tree.cell[gone], strict=True)) == [(2, 1)]
+    assert set(tree.fate[~gone]) == {"alive"} and len(tree) == 4
+
+
 def test_types_of_cells_that_are_removed_by_hand_are_kept(tmp_path):
     path = tmp_path / "run.h5"
     scene = tf.Scene(

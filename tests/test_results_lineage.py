@@ -321,3 +321,14 @@ def test_founders_and_clones(tmp_path):
     with pytest.raises(tf.InputError, match="one cell or more"):
         tree.common_ancestor([], 0)
     assert tree.common_ancestor([0, 1], 0) is None
+
+
+def test_types_of_living_cells_are_those_of_their_own_colony(tmp_path):
+    """Also where ids of colonies are not their places."""
+    cells = tf.Cells([[0.0, 0.0]] * 2, [[1.0, 0.0]] * 2, cell_type=[5, 3], colony=[0, 1])
+    scene = tf.Scene(tf.Growth(rate=1.0), founders=cells, dim=2, dt=0.1)
+    start = scene.bind().start().select([1, 0])
+    tf.simulate(scene, start, until=0.1, record=tmp_path / "run.h5").last()
+    with tf.Results(tmp_path / "run.h5") as results:
+        tree = results.lineage()
+    assert dict(zip(tree.colony.tolist(), tree.cell_type.tolist(), strict=True)) == {0: 5, 1: 3}

@@ -231,6 +231,23 @@ def test_a_field_named_as_a_column_is_kept_beside_it(tmp_path):
     assert table["field.age"].tolist() == [5.0] and table["age"].tolist() == [pytest.approx(0.5)]
 
 
+def test_components_are_numbered_in_their_order():
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2), dim=2, dt=0.1)
+    state = scene.bind().start()
+    state = state.with_fields(displacement=torch.tensor([[1.0, 2.0, 3.0, 4.0]]))
+    table = tf.cell_table(state, internals=True)
+    seen = [table[f"displacement_{k}"].tolist() for k in range(4)]
+    assert seen == [[1.0], [2.0], [3.0], [4.0]]
+
+
+def test_the_tilt_of_an_axis_that_points_down_is_below_0():
+    cells = tf.Cells([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]], [[0.6, 0.0, -0.8], [0.0, 0.6, 0.8]], 2.0)
+    table = tf.cell_table(tf.Scene(tf.Growth(rate=1.0), founders=cells).bind().start())
+    steep = np.arcsin(0.8)
+    assert table["tilt"].tolist() == pytest.approx([-steep, steep])
+    assert table["angle"].tolist() == pytest.approx([0.0, np.pi / 2])
+
+
 def test_space_has_a_tilt(tmp_path):
     axis = np.array([[1.0, 1.0, math.sqrt(2.0)]])
     cells = tf.Cells([[0.0, 0.0, 0.0]], axis / np.linalg.norm(axis), 2.0)

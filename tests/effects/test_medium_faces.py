@@ -159,7 +159,7 @@ def test_a_value_at_a_face_for_several_signals_is_warned_of(face, warns):
         warnings.simplefilter("always")
         made()
         made(boundary=tf.BoundaryConditions())
-    assert len(said) == warns
+    own = [str(x.message) for x in said if "Medium.boundary has one value" in str(x.message)]
+    assert len(own) == warns
     if warns:
-        assert f"{type(face).__name__} along y" in str(said[0].message)
-        assert "food and ahl" in str(said[0].message)
+        assert f"{type(face).__name__} along y" in own[0] and "food and ahl" in own[0]

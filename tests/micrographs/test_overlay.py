@@ -58,6 +58,30 @@ def test_outlines_lie_over_the_cells_of_the_image(tmp_path):
     assert 0.6 < lower[:, 0].mean() < 0.8 and lower[:, 1].mean() == pytest.approx(60 / 80, abs=0.03)
 
 
+def test_outlines_and_names_are_at_the_pixels_of_the_cells():
+    """Also where cells lie askew: an outline holds the pixels of its cell, and no other ones."""
+    from matplotlib.path import Path
+
+    mask = rasterised([20, 55], [20, 40], [0.6, -1.0], [24, 20], [6, 6], SHAPE)
+    mask = np.where(mask == 1, 7, np.where(mask == 2, 4, 0))
+    pytest.importorskip("skimage")
+    found = tf.Cells.from_masks(mask, pixel_size=0.1)
+    ax = tf.pictures.overlay(found, mask, labels=True).figure.axes[0]
+    assert ax.images[0].get_extent() == pytest.approx((-0.05, 7.95, 5.95, -0.05))
+    rows, columns = np.indices(SHAPE)
+    places = 0.1 * np.stack([columns, rows], -1).reshape(-1, 2)
+    named = {}
+    for text in ax.texts[: found.count]:
+        column, row = np.round(np.array(text.get_position()) / 0.1).astype(int)
+        named[int(text.get_text())] = int(mask[row, column])
+    assert named == {7: 7, 4: 4}
+    for outline in ax.collections[0].get_paths():
+        inside = Path(outline.vertices).contains_points(places).reshape(SHAPE)
+        (label,) = set(np.unique(mask[inside])) - {0}
+        both = (inside & (mask == label)).sum()
+        assert both > 0.9 * inside.sum() and both > 0.9 * (mask == label).sum()
+
+
 def test_overlapping_cells_are_red(tmp_path):
     """The two at the left overlap by 0.4 µm, the one at the right is by itself."""
     found = cells()
