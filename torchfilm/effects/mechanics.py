@@ -37,7 +37,17 @@ from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.backends import check_backend, why_torch
 from torchfilm.tools.row_checks import check_variables
-from torchfilm.values import Rule, Value, checked, numbers, physical, quotient, smallest
+from torchfilm.values import (
+    ByType,
+    Distribution,
+    Rule,
+    Value,
+    checked,
+    numbers,
+    physical,
+    quotient,
+    smallest,
+)
 
 # The default length drag: free growth, but for bilateral contacts, which do not hold in it.
 LENGTH_DRAG = {"one-sided": 1e5, "bilateral": 10.0}
@@ -75,18 +85,19 @@ class Mechanics(Effect):
     alpha: how far contacts give way to drag. Default: one-sided contacts follow their force, so
     that their mean overlap is contact_overlap (default 0.014 radii); bilateral ones take 0.1/γ; 1/γ
     is the paper's. Or stiffness: μ·µm/h, physical softness of cells: α = 1/(stiffness·Δt), so that
-    a smaller Δt converges to the motion of soft cells.
+    a smaller Δt converges to the motion of soft cells. Both are one number, or one per colony.
 
     passes: at most this many a step; later ones move only the cells deeper than `overlap`, µm, and,
-    if contacts are one-sided, those near them (default 0.2 radii, 24 passes, 1 for soft cells;
-    bilateral: 0.2 radii or less, 1 pass in the plane and 2 in space, 6 with sub-steps). A smaller
-    `overlap` takes off growth under pressure; a smaller `contact_overlap` does not. tolerance: of a
-    solve. One-sided: relative error of the contact forces, default 0.07. Bilateral: worst residual
-    relative to that at rest, default 0.005; where α γ is below 0.1, times (α γ/0.1)^¼.
-    max_iterations: CG iterations a solve. max_elongation: µm; a colony whose cells would grow more
-    in a step takes sub-steps. adhesion: cells stick together, see `tf.Adhesion`; several kinds add
-    up. Only one-sided contacts have it. backend: "compiled" kernels, on the CPU, or "torch".
-    Default: compiled; where gradients are required torch, whose one-sided contacts kernels solve.
+    if contacts are one-sided, those near them (default 0.2 radii, or up to a radius ten times
+    contact_overlap, 24 passes, 1 for soft cells; bilateral: 0.2 radii or less, 1 pass in the plane
+    and 2 in space, 6 with sub-steps). A smaller `overlap` takes off growth under pressure; a
+    smaller `contact_overlap` does not. tolerance: of a solve. One-sided: relative error of the
+    contact forces, default 0.07. Bilateral: worst residual relative to that at rest, default 0.005;
+    where α γ is below 0.1, times (α γ/0.1)^¼. max_iterations: CG iterations a solve.
+    max_elongation: µm; a colony whose cells would grow more in a step takes sub-steps. adhesion:
+    cells stick together, see `tf.Adhesion`; several kinds add up. Only one-sided contacts have it.
+    backend: "compiled" kernels, on the CPU, or "torch". Default: compiled; where gradients are
+    required torch, whose one-sided contacts kernels solve.
     """
 
     walls: Sequence[Wall] = ()
@@ -130,6 +141,11 @@ class Mechanics(Effect):
             raise checks.InputError(
                 "Mechanics got alpha and stiffness: α = 1/(stiffness·Δt), so give one of the two."
             )
+        for name in ("alpha", "stiffness"):
+            if isinstance(given := getattr(self, name), (ByType, Distribution)):
+                rule = "one number, or a list of one per colony: the same for all cells of a colony"
+                hint = "Cells of which each gives way by its own would push each other unequally."
+                raise checks.input_error(f"Mechanics.{name}", given, rule, hint)
         self._check_parts("walls", Wall, "Plane, Sphere, Box or Channel")
         self._check_parts("adhesion", Adhesion, "tf.Adhesion(…)")
         if self.adhesion and not self.one_sided:

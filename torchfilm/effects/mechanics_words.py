@@ -56,7 +56,7 @@ def _of_one_sided(
     effect: Mechanics, settings: OneSidedSettings, kind: str, device: torch.device
 ) -> list[str]:
     deep = (
-        "0.2 radii"
+        f"{settings.too_deep:g} radii"
         if settings.overlap is None
         else f"{settings.overlap:g} µm (a small bound takes off growth under pressure; a smaller"
         " contact_overlap does not)"

@@ -28,7 +28,7 @@ from torchfilm.kernels.rows import FAR, HARD, half_of
 from torchfilm.kernels.scheme import BEYOND
 from torchfilm.kernels.vectors import WIDTH, any_of, load, store, where
 
-LINE_CONTACT_SINE = 0.4  # as in `physics.contacts`
+LINE_CONTACT_SINE, CROSSED = 0.4, 0.2  # as in `physics.contacts`
 # Centrelines nearer than this share of the distance at which cells touch cross.
 CROSSING = 1e-5
 # Pairs of a block: as many as leave its numbers in the nearest memory.
@@ -307,7 +307,7 @@ def _put_rows(rows, vectors, margin, dof):
         line = (slide > 0) & (high > low)
         share = (high - low) * width
         share = where(share > 1.0, 1.0, share)
-        swing = 0.5 * (high - low) * np.sqrt(sine2)
+        swing = (0.5 / CROSSED) * (high - low) * np.sqrt(sine2)
         apart = np.sqrt(squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s0, t0, dof)) / swing
         apart = where(apart > 1.0, 1.0, apart)
         share = where(swing > 1e-6 * ra, share * apart, share)

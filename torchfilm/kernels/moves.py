@@ -71,6 +71,20 @@ def carry_out(x, axis, length, y, i, scratch, angle, least, dof):
 
 
 @lean
+def still_moving(about, i, last, y, scale, pushed, dof):
+    """Put into about[i] the part of the last move of cell i that it still makes: the point between
+    rest and that move that is nearest to its move y · scale. 0 where nothing was pushed."""
+    d = 2 if len(dof) == 4 else 3
+    along, square = 0.0, 0.0
+    for k in range(d):
+        along += y[i, k] * scale[i, k] * last[i, k]
+        square += last[i, k] ** 2
+    share = min(max(along / square, 0.0), 1.0) if pushed and square > 0 else 0.0
+    for k in range(d):
+        about[i, k] = share * last[i, k]
+
+
+@lean
 def bounded(y, i, scale, about, bound, length, scratch, dof):
     """Puts the move of cell i into scratch[MOVE]: its translation at most `bound` from `about`
     (n, D), and its rotation at most `bound` at the ends. Returns the angle, and whether it was cut

@@ -2,15 +2,20 @@
 
 The scheme is for cells that only push, under any drag. Neighbours move almost alike, though they
 may move farther than their own width in a step. So rows are made for all pairs that are near, not
-only for those that overlap; a pass moves a cell only so far from its last move; and where cells
-still lie deep, they and their neighbours are solved again. α follows the force: contacts are as
-hard as leaves a small mean overlap, at any drag and any pressure.
+only for those that overlap; a pass moves a cell only so far from what it has of its last move; and
+where cells still lie deep, they and their neighbours are solved again. α follows the force:
+contacts are as hard as leaves a small mean overlap, at any drag and any pressure.
 """
 
 # In mean radii of a colony: rows are made for pairs nearer than MARGIN, and a pass moves a cell at
-# most MARGIN away from its last move; a pass is repeated where cells lie deeper than TOO_DEEP;
-# contacts are as hard as leaves a mean overlap of OVERLAP.
+# most MARGIN away from its last move, or from that part of it that the cell still has (its point
+# nearest to the move: else cells that were fast would coast where growth ends, and 7 % of a channel
+# would leave); a pass is repeated where cells lie deeper than TOO_DEEP; contacts are as hard as
+# leaves a mean overlap of OVERLAP.
 MARGIN, TOO_DEEP, OVERLAP = 0.6, 0.2, 0.014
+# Where a larger mean overlap is wanted, too deep is DEEPER times that, up to DEEPEST: else passes
+# would part in each step what the first one leaves as wanted.
+DEEPER, DEEPEST = 10.0, 1.0
 # In space two cells side by side at a small angle touch at a point, and may turn about it. That
 # brings other parts of them together, which the row of the point does not foresee: a turn of 0.2
 # rad makes overlaps of up to 0.12 µm, deeper than TOO_DEEP, and a squeezed cell would turn to and

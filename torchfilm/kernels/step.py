@@ -37,7 +37,7 @@ from torchfilm.kernels.contact_pieces import shared_pair_rows, shares
 from torchfilm.kernels.contacts import most_rows, pair_rows
 from torchfilm.kernels.found import deep_cells, found_after, found_contacts
 from torchfilm.kernels.memory import TOP, copied, give_back, room, zeros
-from torchfilm.kernels.moves import drags
+from torchfilm.kernels.moves import drags, still_moving
 from torchfilm.kernels.neighbours import spatial_order
 from torchfilm.kernels.rows import (
     HARD,
@@ -69,7 +69,6 @@ from torchfilm.kernels.scheme import (
     SLOWEST,
     SOFTER,
     SOFTEST,
-    TOO_DEEP,
     UNMOVED,
 )
 from torchfilm.kernels.solve import minimise
@@ -77,7 +76,7 @@ from torchfilm.kernels.solve_parts import overlaps
 from torchfilm.kernels.team import next_of
 from torchfilm.kernels.wall_moves import move_cells
 
-# Places in the settings. DEEP ≤ 0: TOO_DEEP radii. YIELD: mean overlap of contacts, radii. PERIODS:
+# Places in the settings. DEEP: µm, or if below 0 in radii. YIELD: mean overlap, radii. PERIODS:
 # the first of three, see `kernels.images`.
 DEEP, TOLERANCE, MOST_PASSES, LIMIT, SOFT, YIELD, PERIODS = range(7)
 
@@ -271,15 +270,14 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
 
 @lean
 def _carried_out(memory, x, axis, radius, last, gaps, walls, margin, number, arrays, dof):
-    """Carry out the move of a pass. In the first it is bounded about the last one, which it then
-    becomes; but without a push, by the rows' gaps, nothing moves. Returns how many cells were cut
-    short."""
+    """Carry out the move of a pass. In the first it is bounded about what it has of the last one,
+    which it then becomes; but without a push, by the rows' gaps, nothing moves. Returns how many
+    cells were cut short."""
     length, least, _, _, _, scale, y, _, about = arrays
     pushed = number == 0 and overlaps(gaps, gaps.shape[0])
     scratch = room(memory, (3, len(dof)), np.float64)
     for i in range(last.shape[0]):
-        for k in range(last.shape[1]):
-            about[i, k] = last[i, k] if pushed else 0.0
+        still_moving(about, i, last, y, scale, pushed, dof)
     bound = margin * (SHORTER if number > LONG_MOVES else 1.0)
     clipped = move_cells(
         x, axis, length, radius, y, scale, about, bound, least, walls, scratch, dof
@@ -337,7 +335,7 @@ def _of_colony(base, growth, radius, drag, settings):
         wide += radius[i] / n
         across += viscosity[i] * (base[i] + growth[i] + 2 * radius[i]) / n
         held += length_drag[i] * max(growth[i], 0.0) / n
-    deep = settings[DEEP] if settings[DEEP] > 0 else TOO_DEEP * wide
+    deep = settings[DEEP] if settings[DEEP] > 0 else -settings[DEEP] * wide
     softest = SOFTEST * settings[YIELD] / OVERLAP / across
     target, hardest = settings[YIELD] * wide, HARDEST * softest
     if held > 0:

@@ -69,8 +69,8 @@ def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
 class WallForces:
     """The forces of each colony's cells on walls. force: (B, S) μ·µm²/h, at right angles to each of
     S surfaces, in the order of the walls: a plane and a sphere have one, a Box two for each axis
-    (low, high), a Channel its two sides and its ends. facing: for each surface the direction
-    towards the cells, as numbers, or None of a sphere."""
+    (low, high), a Channel those of its ends that are closed, then its sides. facing: the direction
+    from each surface to the cells, as numbers, or None of a sphere."""
 
     force: Tensor
     facing: tuple[tuple[float | Tensor, ...] | None, ...]

@@ -109,8 +109,9 @@ def alpha_arrays(
 @lru_cache(maxsize=100)
 def _kernel_of(settings: OneSidedSettings | ContactSettings):
     """The kernel of this kind of contacts, and its settings as numbers."""
-    overlap = -1.0 if settings.overlap is None else settings.overlap
+    overlap = settings.overlap
     if isinstance(settings, ContactSettings):
+        overlap = -1.0 if overlap is None else overlap
         from torchfilm.kernels.bilateral import step_colonies as of_bilateral
 
         tolerance = -1.0 if settings.tolerance is None else settings.tolerance
@@ -120,6 +121,7 @@ def _kernel_of(settings: OneSidedSettings | ContactSettings):
     from torchfilm.kernels.step import step_colonies
 
     periods = () if settings.space is None else settings.space.period
+    overlap = -settings.too_deep if overlap is None else overlap
     numbers = [
         overlap, settings.tolerance, settings.passes, settings.max_iterations, settings.soft,
         settings.contact_overlap, *periods, *[0.0] * (3 - len(periods)),

@@ -21,6 +21,10 @@ from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_s
 # Sine of the angle between two axes at which a line of contact has shrunk to a point (see
 # `line_points`).
 LINE_CONTACT_SINE = 0.4
+# Where centrelines cross, the ends of a line of contact lie at most CROSSED times their distance to
+# its sides, so that cells are there at most 2 % farther apart than at the crossing. Where they were
+# as far aside as the centrelines are apart, nothing parted rods of 12 µm that were 0.15 µm deep.
+CROSSED = 0.2
 
 
 @dataclass(frozen=True)
@@ -158,7 +162,7 @@ def line_points(
     share = (along.length / (0.5 * (a.radius + b.radius))).clamp(max=1.0)
     # so does the line of two centrelines that cross, whose ends lie on opposite sides: the contact
     # is near the crossing
-    swing = 0.5 * along.length * safe_sqrt(sine2)
+    swing = (0.5 / CROSSED) * along.length * safe_sqrt(sine2)
     crossed = swing > 1e-6 * a.radius
     apart = safe_sqrt(_distance2(between, a.axis, b.axis, s0, t0))
     share = share * torch.where(crossed, apart / torch.where(crossed, swing, 1.0), 1.0).clamp(

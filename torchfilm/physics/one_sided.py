@@ -27,7 +27,6 @@ from torchfilm.kernels.scheme import (
     SLOWEST,
     SOFTER,
     SOFTEST,
-    TOO_DEEP,
     UNMOVED,
 )
 from torchfilm.physics import capsule, compiled_solve
@@ -50,7 +49,7 @@ from torchfilm.physics.wall_contacts import (
 )
 from torchfilm.tools.ragged import marked
 from torchfilm.tools.reads import numbers, rows_where
-from torchfilm.tools.vectors import nearest_root, safe_norm
+from torchfilm.tools.vectors import nearest_root, nearest_to, safe_norm
 
 
 def contact_steps(given: StepInput) -> StepResult:
@@ -71,7 +70,7 @@ def contact_steps(given: StepInput) -> StepResult:
             at = _drifted(at, given, torch.where((steps > 1) & (k < steps), share, 0.0))
         active = (k < steps) & (at.status != NOT_FINITE)
         last_of_many = (k + 1 == steps) & (steps >= MANY_SUBSTEPS)
-        deep = torch.where(last_of_many, DEEP_AFTER_MANY, TOO_DEEP)
+        deep = torch.where(last_of_many, DEEP_AFTER_MANY, given.settings.too_deep)
         at = _OneStep(given, at.length, growth, deep, active).taken(at)
     return at
 
@@ -258,7 +257,8 @@ class _OneStep:
         about = torch.zeros_like(move[:, : self.dim])
         if first_pass:  # without a push nothing moves
             pushes = part.of_rows.any(part.gap.detach() < 0).index_select(0, self.groups.owner)
-            about = torch.where(pushes.unsqueeze(1), at.move[:, : self.dim], about)
+            about = nearest_to(move[:, : self.dim], at.move[:, : self.dim])
+            about = torch.where(pushes.unsqueeze(1), about, 0.0)
         moving = moving & self.of_cells(sound).bool()
         return self._moved(at, move, about, moving, least, number)
 
@@ -408,8 +408,7 @@ class _OneStep:
         made = torch.cat([step, turn.unsqueeze(1) * move[:, dim:-1], move[:, -1:]], 1)
         share = self._share_to_hard_walls(at, made)
         clipped = moving & ((part < 1) | (turn < 1) | (share < 1))
-        made = share.unsqueeze(1) * made
-        made = torch.where(moving.unsqueeze(1), made, 0.0)
+        made = torch.where(moving.unsqueeze(1), share.unsqueeze(1) * made, 0.0)
         axis = torch.where(moving.unsqueeze(1), capsule.rotate(at.axis, made[:, dim:-1]), at.axis)
         length = at.length + made[:, -1]
         length = torch.where(length >= least, length, least)

@@ -68,3 +68,10 @@ def nearest_root(x: Tensor) -> Tensor:
         return found
     plain, nearest = both(found)[0], torch.from_numpy(np.sqrt(both(x)[0].numpy()))
     return found + torch.where(nearest == plain, 0.0, nearest - plain)
+
+
+def nearest_to(point: Tensor, end: Tensor) -> Tensor:
+    """The point between 0 and `end` that is nearest to `point`, (N, d) each."""
+    along, square = (end * point).sum(1), (end * end).sum(1)
+    share = (along / torch.where(square > 0, square, 1.0)).clamp(0.0, 1.0)
+    return share.unsqueeze(1) * end
