@@ -17,6 +17,7 @@ from torchfilm.pictures.page import plan_layout
 from torchfilm.state import OUTSIDE
 
 pytest.importorskip("matplotlib")
+from matplotlib.figure import Figure  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +104,21 @@ def test_replicates_whose_kinds_are_counted_apart_have_their_ids(tmp_path):
     tf.simulate(scene, start, until=0.2, record=tmp_path / "run.h5").last()
     lines = pictures.time_course(tmp_path / "run.h5", by="cell_type").figure
     assert [text.split(", ")[1] for text in legend(lines)] == ["colony 2", "colony 1", "colony 0"]
+
+
+def test_parameters_that_hardly_differ_have_names_of_their_own(tmp_path):
+    """Colonies of one name are replicates, whose mean a time course draws."""
+    scene = tf.Scene(tf.Growth(rate=[0.50001, 0.50002, 2.0]), dim=2, dt=0.1)
+    tf.simulate(scene, until=0.5, record=tmp_path / "run.h5").last()
+    course = pictures.time_course(tmp_path / "run.h5", "length")
+    shown = [text.get_text() for text in course.figure.axes[0].get_legend().texts]
+    assert shown == ["rate = 0.50001", "rate = 0.50002", "rate = 2"]
+
+
+@pytest.mark.parametrize("width", [1000 / 3, 1e3 / 0.3, 10 / 0.3 * (1 - 1e-16), 7.0])
+def test_a_scale_bar_is_at_most_three_tenths_of_the_width(width):
+    """The logarithm of 99.99999999999999 is 2."""
+    ax = Figure().add_subplot()
+    ax.set_xlim(0, width)
+    size = pictures.scale_bar(ax)
+    assert 0.1 * width < size <= 0.3 * width

@@ -320,7 +320,8 @@ def scale_bar(ax: Axes) -> float:
     low, high = sorted(ax.get_xlim())
     rough = 0.3 * (high - low)
     power = math.floor(math.log10(rough))
-    size = max(s for s in (10.0**power, 2 * 10.0**power, 5 * 10.0**power) if s <= rough)
+    # half of it, too: the logarithm of a number just below a power of ten is rounded up
+    size = max(s for x in (0.5, 1, 2, 5) if (s := x * 10.0**power) <= rough)
     # in units of the axes, so that the bar moves with them
     below = ax.transAxes + ScaledTranslation(0, -5 / 72, ax.figure.dpi_scale_trans)
     ax.add_line(ScaleBar(size, below, rcParams["text.color"]))

@@ -264,7 +264,11 @@ def _named(parameters: Mapping[str, np.ndarray]) -> list[str] | None:
         return None
     ((path, values),) = found.items()
     name = column_names([path], set())[path]
-    return [f"{name} = {value:.4g}" for value in values]
+    for digits in range(4, 18):  # as many as it takes to tell them apart
+        words = [f"{value:.{digits}g}" for value in values.tolist()]
+        if len(set(words)) == len(np.unique(values)):
+            break
+    return [f"{name} = {word}" for word in words]
 
 
 def unit_of(name: str, units: Mapping[str, str]) -> str:
