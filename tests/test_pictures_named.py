@@ -17,7 +17,7 @@ from torchfilm.pictures.page import plan_layout
 from torchfilm.state import OUTSIDE
 
 pytest.importorskip("matplotlib")
-from matplotlib.figure import Figure  # noqa: E402
+from matplotlib.figure import Figure
 
 
 @pytest.fixture(scope="module")
