@@ -163,3 +163,26 @@ def test_a_value_at_a_face_for_several_signals_is_warned_of(face, warns):
     assert len(own) == warns
     if warns:
         assert f"{type(face).__name__} along y" in own[0] and "food and ahl" in own[0]
+
+
+@pytest.mark.parametrize(
+    ("outside", "reservoir", "value", "warns"),
+    [
+        ("reservoir", 0.0, 1.0, True),
+        ("reservoir", 1.0, 1.0, False),
+        ("reservoir", tf.Schedule({0: 0.0, 2: 1.0}), 1.0, False),
+        ("reservoir", 0.0, 0.0, False),
+        ("error", 0.0, 1.0, False),
+    ],
+)
+def test_an_empty_reservoir_behind_a_face_that_supplies_is_warned_of(
+    outside, reservoir, value, warns
+):
+    """Cells half a micrometre beyond a fed face would starve."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        tf.Medium(
+            food=tf.Signal(1e3, reservoir=reservoir), box=((0, 0), (8, 8)), spacing=4.0,
+            boundary=tf.BoundaryConditions(y=tf.Dirichlet(value)), outside=outside,
+        )  # fmt: skip
+    assert len([x for x in said if "find a reservoir without it" in str(x.message)]) == warns

@@ -16,7 +16,7 @@ from torchfilm.effect import DIVISION, TRANSPORT, Binding, BoundEffect, Effect
 from torchfilm.effects.bound_medium import BoundMedium, FirstHalf
 from torchfilm.effects.medium_coverage import BLOCK, DaughtersCoverage, GridCoverage
 from torchfilm.effects.medium_transport import EXACT, Transport
-from torchfilm.effects.medium_values import warn_of_one_value
+from torchfilm.effects.medium_values import warn_of_faces
 from torchfilm.effects.signal import Flow, Signal, check_boundary, reach_of, smear_of, velocity
 from torchfilm.parameters import number_range
 from torchfilm.signals.boundary_conditions import BoundaryConditions
@@ -129,7 +129,7 @@ class Medium(Effect):
         signals = _named(keywords("Medium", signals, "signals", options))
         low, high, voxel = checked_box(box, spacing, depth, height)
         _check_medium(boundary, outside, grows, margin, method, steps, splitting, obstacles)
-        warn_of_one_value(boundary, signals)
+        warn_of_faces(boundary, outside, signals)
         if exchange is not None:
             checks.choice("Medium.exchange", exchange, EXCHANGES)
         check_backend("Medium", backend)

@@ -28,19 +28,41 @@ Corner = Sequence[float]
 BITS = 21  # of the number of a voxel along an axis, in its key
 
 
-def warn_of_one_value(boundary: BoundaryConditions | None, signals: Mapping[str, Signal]) -> None:
-    """Warn where a face of the medium supplies several signals with one value."""
+def warn_of_faces(
+    boundary: BoundaryConditions | None, outside: str, signals: Mapping[str, Signal]
+) -> None:
+    """Warn where a face of the medium supplies several signals with one value, and where cells
+    beyond a face that supplies a signal find none of it in the reservoir."""
     several = [name for name, signal in signals.items() if signal.boundary is None]
-    if boundary is None or len(several) < 2:
-        return
-    for axis, pair in zip("xyz", boundary.pairs, strict=True):
-        for face in pair:
-            if any(bool((numbers(x) != 0).any()) for x in each_value(face.outside_value())):
-                warn(
-                    f"{type(face).__name__} along {axis} in Medium.boundary has one value for"
-                    f" {' and '.join(several)}: each has it there. Give faces to the signal that"
-                    f" they supply, {several[0]}=tf.Signal(…, boundary=…), or to each."
-                )
+    for axis, face in _supplying(boundary) if len(several) > 1 else ():
+        warn(
+            f"{face} along {axis} in Medium.boundary has one value for {' and '.join(several)}:"
+            " each has it there. Give faces to the signal that they supply,"
+            f" {several[0]}=tf.Signal(…, boundary=…), or to each."
+        )
+    for name, signal in signals.items() if outside == "reservoir" else ():
+        faces = _supplying(signal.boundary or boundary)
+        if faces and not any(_supplies(x) for x in each_value(signal.reservoir)):
+            axis, face = faces[0]
+            warn(
+                f"{face} along {axis} supplies {name}, and cells beyond the box find a reservoir"
+                f" without it: write {name}=tf.Signal(…, reservoir=…), or let the box reach farther."
+            )
+
+
+def _supplying(boundary: BoundaryConditions | None) -> list[tuple[str, str]]:
+    """The axes and kinds of the faces with a value other than 0."""
+    each = () if boundary is None else zip("xyz", boundary.pairs, strict=True)
+    faces = [(axis, face) for axis, pair in each for face in pair]
+    return [
+        (axis, type(face).__name__)
+        for axis, face in faces
+        if any(_supplies(x) for x in each_value(face.outside_value()))
+    ]
+
+
+def _supplies(value: Any) -> bool:
+    return bool((numbers(value) != 0).any())
 
 
 def on_grid(
