@@ -69,7 +69,7 @@ def mechanics(draw: Contacts, capsules: Capsules, dt: float) -> tf.Mechanics:
     """Returns the contact mechanics of a draw."""
     given: dict[str, Any] = {}
     if draw.give is not None:
-        given["alpha" if draw.give > 0 else "stiffness"] = each(draw, abs(draw.give))
+        given["alpha" if draw.give > 0 else "stiffness"] = abs(draw.give)
     if draw.contacts == "one-sided":
         given |= {"passes": draw.passes, "max_elongation": draw.elongation}
         least = min([draw.viscosity, *(viscosity for _, viscosity in draw.drags)])

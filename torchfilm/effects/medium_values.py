@@ -46,7 +46,7 @@ def warn_of_faces(
             axis, face = faces[0]
             warn(
                 f"{face} along {axis} supplies {name}, and cells beyond the box find a reservoir"
-                f" without it: write {name}=tf.Signal(…, reservoir=…), or let the box reach farther."
+                f" without it: write {name}=tf.Signal(…, reservoir=…), or make the box larger."
             )
 
 

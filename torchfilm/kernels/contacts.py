@@ -307,10 +307,20 @@ def _put_rows(rows, vectors, margin, dof):
         line = (slide > 0) & (high > low)
         share = (high - low) * width
         share = where(share > 1.0, 1.0, share)
-        swing = (0.5 / CROSSED) * (high - low) * np.sqrt(sine2)
-        apart = np.sqrt(squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s0, t0, dof)) / swing
-        apart = where(apart > 1.0, 1.0, apart)
-        share = where(swing > 1e-6 * ra, share * apart, share)
+        swing = 0.5 * (high - low) * np.sqrt(sine2)
+        apart = np.sqrt(squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s0, t0, dof))
+        most = where(apart > swing, 1.0, apart / swing)
+        share = where(swing > 1e-6 * ra, share * most, share)
+        if len(dof) == 8:
+            inner = ha + hb  # how far the closest points are from the nearer end of the stretch
+            for side, at in ((-1.0, low), (1.0, high)):
+                s1 = clamp(at * unproject, ha)
+                t1 = clamp(sign * (at - offset) * unproject, hb)
+                away = where(side * (s1 - s0) < side * sign * (t1 - t0), s1 - s0, sign * (t1 - t0))
+                inner = where(side * away < inner, side * away, inner)
+            aside = where(inner > 0, inner, 0.0) * np.sqrt(sine2)
+            most = where(CROSSED * apart > aside, 1.0, CROSSED * apart / aside)
+            share = where(aside > 1e-6 * ra, share * most, share)
         slide = slide * slide * share
         free_a = cosine * t0 + dot_of(bx, by, bz, ax, ay, az, dof)
         free_b = cosine * s0 - dot_of(bx, by, bz, cx, cy, cz, dof)

@@ -14,16 +14,16 @@ from torch import Tensor
 
 from torchfilm.kernels.bilateral_scheme import CANDIDATE, NEAR
 from torchfilm.physics.space import PeriodicSpace
-from torchfilm.physics.stretches import stretch_of
+from torchfilm.physics.stretches import Stretch, stretch_of
 from torchfilm.tools.reads import rows_where
 from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_sqrt
 
 # Sine of the angle between two axes at which a line of contact has shrunk to a point (see
 # `line_points`).
 LINE_CONTACT_SINE = 0.4
-# Where centrelines cross, the ends of a line of contact lie at most CROSSED times their distance to
-# its sides, so that cells are there at most 2 % farther apart than at the crossing. Where they were
-# as far aside as the centrelines are apart, nothing parted rods of 12 µm that were 0.15 µm deep.
+# Where centrelines cross, the nearer end of a line of contact lies at most CROSSED times their
+# distance to its side, so that cells are there at most 2 % farther apart than at it. Where
+# it was as far aside as they are apart, nothing parted rods of 12 µm that were 0.15 µm deep.
 CROSSED = 0.2
 
 
@@ -162,18 +162,32 @@ def line_points(
     share = (along.length / (0.5 * (a.radius + b.radius))).clamp(max=1.0)
     # so does the line of two centrelines that cross, whose ends lie on opposite sides: the contact
     # is near the crossing
-    swing = (0.5 / CROSSED) * along.length * safe_sqrt(sine2)
+    swing = 0.5 * along.length * safe_sqrt(sine2)
     crossed = swing > 1e-6 * a.radius
     apart = safe_sqrt(_distance2(between, a.axis, b.axis, s0, t0))
     share = share * torch.where(crossed, apart / torch.where(crossed, swing, 1.0), 1.0).clamp(
         max=1.0
     )
+    if len(between) == 3:
+        aside = _inner(along, s0, t0, cosine) * safe_sqrt(sine2)
+        crossed = aside > CROSSED * apart
+        share = share * torch.where(
+            crossed, CROSSED * apart / torch.where(crossed, aside, 1.0), 1.0
+        )
     slide = torch.where(line, slide * slide * share, 0.0)
     end_a0 = _end_while_sliding(s0, cosine * t0 + dot(between, a.axis), a, slide)
     end_b0 = _end_while_sliding(t0, cosine * s0 - dot(between, b.axis), b, slide)
     start = s0, t0, end_a0, end_b0
     s, t, end_a, end_b = (x0 + slide * (x - x0) for x, x0 in zip(along.points, start, strict=True))
     return s, t, end_a, end_b, line
+
+
+def _inner(along: Stretch, s0: Tensor, t0: Tensor, cosine: Tensor) -> Tensor:
+    """How far the closest points are from the nearer end of the stretch, (P,) µm; 0 beyond it."""
+    (s_low, s_high), (t_low, t_high) = along.points[:2]
+    sign = torch.where(cosine < 0, -1.0, 1.0).to(s0.dtype)
+    ways = s0 - s_low, s_high - s0, sign * (t0 - t_low), sign * (t_high - t0)
+    return torch.stack(ways).amin(0).clamp(min=0.0)
 
 
 def _end_while_sliding(s: Tensor, free: Tensor, cell: Capsules, slide: Tensor) -> Tensor:
