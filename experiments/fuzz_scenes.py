@@ -90,7 +90,7 @@ def mechanics(draw: Contacts, capsules: Capsules, dt: float) -> tf.Mechanics:
         periodic={axis: (-side, side) for axis in draw.periodic},
         dim=capsules.dim,
         viscosity=each(draw, viscosity),
-        length_drag=each(draw, length_drag),
+        length_drag=length_drag if draw.contacts == "bilateral" else each(draw, length_drag),
         contacts=draw.contacts,
         max_iterations=300,
         tolerance=draw.tolerance,

@@ -18,6 +18,7 @@ from torchfilm.state import OUTSIDE
 
 pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 
 @pytest.fixture(scope="module")
@@ -122,3 +123,10 @@ def test_a_scale_bar_is_at_most_three_tenths_of_the_width(width):
     ax.set_xlim(0, width)
     size = pictures.scale_bar(ax)
     assert 0.1 * width < size <= 0.3 * width
+
+
+def test_values_of_ones_own_have_no_unit():
+    state = tf.Scene(tf.Growth(rate=1.0), dim=2).bind().start()
+    drawn = tf.show(state, values={"age": [7.0]})
+    shown = {text.get_text() for text in drawn.figure.findobj(Text)}
+    assert "age" in shown and "age (h)" not in shown

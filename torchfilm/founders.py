@@ -34,7 +34,7 @@ def checked_type_names(names: Sequence[str], founders: Cells) -> tuple[str, ...]
         if name in names[:k]:
             raise checks.input_error(f"Scene.type_names[{k}]", name, "another name than the others")
     if names and founders.cell_type is None:
-        hint = "Such as tf.inoculum(20, 10.0, types={0: 0.5, 1: 0.5})."
+        hint = "Write type_names=(), or give types: tf.inoculum(20, 10.0, types={0: 0.5, 1: 0.5})."
         raise checks.input_error(
             "Scene.type_names", tuple(names), "left out: the founders have no cell_type", hint
         )

@@ -28,6 +28,9 @@ def test_a_hazard_that_growth_would_dilute_is_refused():
         made(dilution=("dying",))
     for dilution in (("gfp", "rfp"), False):
         made(dilution=dilution)
+    named = tf.Circuit(kills, species=["dying", "gfp", "rfp"], name="toxin")
+    with pytest.raises(tf.InputError, match=r"dilution=\('gfp', 'rfp'\)"):
+        tf.Scene(named, tf.Lysis(hazard="toxin_dying"), founders=FOUR, dim=2)
 
 
 @pytest.mark.parametrize("option", ["factor", "hazard"])

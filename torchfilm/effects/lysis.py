@@ -202,9 +202,11 @@ class Lysis(Effect):
         return (BoundLysis(self, binding),)
 
     def check_scene(self, effects: Sequence[Effect], founders: Any) -> None:
-        for diluted in (getattr(other, "diluted_fields", ()) for other in effects):
+        for other in effects:
+            diluted = getattr(other, "diluted_fields", ())
             if self.hazard in diluted:
-                others = tuple(name for name in diluted if name != self.hazard)
+                of = f"{getattr(other, 'name', '')}_"  # fields of a named circuit begin with it
+                others = tuple(n.removeprefix(of) for n in diluted if n != self.hazard)
                 write = f"dilution={others}" if others else "dilution=False"
                 raise checks.InputError(
                     f"Lysis.hazard = {self.hazard!r}: growth dilutes this species, so that fewer"

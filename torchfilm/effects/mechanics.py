@@ -146,6 +146,12 @@ class Mechanics(Effect):
                 rule = "one number, or a list of one per colony: the same for all cells of a colony"
                 hint = "Cells of which each gives way by its own would push each other unequally."
                 raise checks.input_error(f"Mechanics.{name}", given, rule, hint)
+        if not self.one_sided and isinstance(self.length_drag, (ByType, Distribution)):
+            rule = (
+                "one number, or a list of one per colony, where contacts are bilateral: α is 0.1/γ"
+            )
+            hint = 'Cells of a γ of their own push each other alike by contacts="one-sided".'
+            raise checks.input_error("Mechanics.length_drag", self.length_drag, rule, hint)
         self._check_parts("walls", Wall, "Plane, Sphere, Box or Channel")
         self._check_parts("adhesion", Adhesion, "tf.Adhesion(…)")
         if self.adhesion and not self.one_sided:

@@ -54,11 +54,12 @@ def _supplying(boundary: BoundaryConditions | None) -> list[tuple[str, str]]:
     """The axes and kinds of the faces with a value other than 0."""
     each = () if boundary is None else zip("xyz", boundary.pairs, strict=True)
     faces = [(axis, face) for axis, pair in each for face in pair]
-    return [
+    found = (
         (axis, type(face).__name__)
         for axis, face in faces
         if any(_supplies(x) for x in each_value(face.outside_value()))
-    ]
+    )
+    return [*dict.fromkeys(found)]
 
 
 def _supplies(value: Any) -> bool:

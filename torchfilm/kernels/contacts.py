@@ -277,6 +277,18 @@ def _put_far_row(rows, k, g, far, s, t, end_a, end_b, margin, dof):
         _put(rows, HAS + 2 + k, g, 0.0 * has)
 
 
+@lean(inline=True)
+def _inner(s0, t0, low, high, offset, unproject, sign, ha, hb):
+    """How far the closest points are from the nearer end of the stretch."""
+    inner = ha + hb
+    for side, at in ((-1.0, low), (1.0, high)):
+        s1, t1 = clamp(at * unproject, ha), clamp(sign * (at - offset) * unproject, hb)
+        own, other = side * (s1 - s0), side * sign * (t1 - t0)
+        inner = where(own < inner, own, inner)
+        inner = where(other < inner, other, inner)
+    return inner
+
+
 @lean
 def _put_rows(rows, vectors, margin, dof):
     """The rows of pairs, before they are scaled: one at the closest points, or where the contact is
@@ -312,12 +324,7 @@ def _put_rows(rows, vectors, margin, dof):
         most = where(apart > swing, 1.0, apart / swing)
         share = where(swing > 1e-6 * ra, share * most, share)
         if len(dof) == 8:
-            inner = ha + hb  # how far the closest points are from the nearer end of the stretch
-            for side, at in ((-1.0, low), (1.0, high)):
-                s1 = clamp(at * unproject, ha)
-                t1 = clamp(sign * (at - offset) * unproject, hb)
-                away = where(side * (s1 - s0) < side * sign * (t1 - t0), s1 - s0, sign * (t1 - t0))
-                inner = where(side * away < inner, side * away, inner)
+            inner = _inner(s0, t0, low, high, offset, unproject, sign, ha, hb)
             aside = where(inner > 0, inner, 0.0) * np.sqrt(sine2)
             most = where(CROSSED * apart > aside, 1.0, CROSSED * apart / aside)
             share = where(aside > 1e-6 * ra, share * most, share)

@@ -25,9 +25,9 @@ DEEPER, DEEPEST = 10.0, 1.0
 # have no such rows, which would make them stiffer.
 BEYOND = 0.5
 # In the last of MANY_SUBSTEPS or more, which leave little of the order that was, cells part that
-# lie deeper than this. In every sub-step it would take off growth under pressure: at γ = 1,000 a
-# fifth of a colony's volume, where a step takes two or four.
-DEEP_AFTER_MANY, MANY_SUBSTEPS = 0.08, 8
+# lie deeper than this share of what is too deep. In every sub-step it would take off growth under
+# pressure: at γ = 1,000 a fifth of a colony's volume, where a step takes two or four.
+DEEP_AFTER_MANY, MANY_SUBSTEPS = 0.4, 8
 # The most that α μ L may be at that overlap, and the least as a share of it; less where the force
 # that stops growth, γ Δl, would make more than the share UNMOVED of that overlap. (Drags differ: in
 # a full box with γ = 1e6 and μ = 0.01 cells would lie half their width deep in the walls.)

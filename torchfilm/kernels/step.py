@@ -421,7 +421,7 @@ def step_colonies(team, memory, taken, which, begin, dt, longest, cells, drags, 
                 move_along(own_x, own_axis, drift, -1.0, dof)
             for k in range(steps):
                 if settings[DEEP] <= 0 and k + 1 == steps >= MANY_SUBSTEPS:
-                    own_settings[DEEP] = DEEP_AFTER_MANY * _mean(own_radius)
+                    own_settings[DEEP] = -DEEP_AFTER_MANY * settings[DEEP] * _mean(own_radius)
                 give_back(memory, top)
                 report[ALPHA] = 0.0
                 if steps > 1:

@@ -70,7 +70,7 @@ def contact_steps(given: StepInput) -> StepResult:
             at = _drifted(at, given, torch.where((steps > 1) & (k < steps), share, 0.0))
         active = (k < steps) & (at.status != NOT_FINITE)
         last_of_many = (k + 1 == steps) & (steps >= MANY_SUBSTEPS)
-        deep = torch.where(last_of_many, DEEP_AFTER_MANY, given.settings.too_deep)
+        deep = torch.where(last_of_many, DEEP_AFTER_MANY, 1.0) * given.settings.too_deep
         at = _OneStep(given, at.length, growth, deep, active).taken(at)
     return at
 

@@ -172,7 +172,8 @@ def _with(values: Mapping[str, Any] | None, frame: Frame) -> Frame:
         if name in frame.cells:
             raise checks.input_error("values", name, "other names than the cells have already")
         more[name] = array
-    return replace(frame, cells={**frame.cells, **more})
+    units = {**frame.units, **dict.fromkeys(more, "")}  # "age" may be one of them
+    return replace(frame, cells={**frame.cells, **more}, units=units)
 
 
 def _recorded_frame(
