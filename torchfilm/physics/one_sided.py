@@ -257,7 +257,7 @@ class _OneStep:
         about = torch.zeros_like(move[:, : self.dim])
         if first_pass:  # without a push nothing moves
             pushes = part.of_rows.any(part.gap.detach() < 0).index_select(0, self.groups.owner)
-            about = nearest_to(move[:, : self.dim], at.move[:, : self.dim])
+            about = nearest_to(move[:, : self.dim].T, at.move[:, : self.dim].T).T
             about = torch.where(pushes.unsqueeze(1), about, 0.0)
         moving = moving & self.of_cells(sound).bool()
         return self._moved(at, move, about, moving, least, number)

@@ -71,7 +71,6 @@ def nearest_root(x: Tensor) -> Tensor:
 
 
 def nearest_to(point: Tensor, end: Tensor) -> Tensor:
-    """The point between 0 and `end` that is nearest to `point`, (N, d) each."""
-    along, square = (end * point).sum(1), (end * end).sum(1)
-    share = (along / torch.where(square > 0, square, 1.0)).clamp(0.0, 1.0)
-    return share.unsqueeze(1) * end
+    """The point between 0 and `end` that is nearest to `point`, (d, K) each."""
+    along, square = dot(end, point), dot(end, end)
+    return end * (along / torch.where(square > 0, square, 1.0)).clamp(0.0, 1.0)
