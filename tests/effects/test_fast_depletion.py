@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import torchfilm as tf
+from torchfilm.effect import ExchangePlan
 from torchfilm.effects.circuit_words import together_lines
 from torchfilm.signals import joint
 from torchfilm.tools.ragged import Groups
@@ -122,9 +123,14 @@ def left_of(k):
 
 
 def test_it_is_explained():
-    line = together_lines({"drug": 1e3})[1]
-    assert "in parts of a step while cells take over 2 % of it in one, or 4 % leave and" in line
-    assert "in parts" not in " ".join(together_lines({"drug": 100.0}))
+    def lines(times):
+        medium = SimpleNamespace(steps=1)
+        transport = SimpleNamespace(medium=medium, exchanges_per_hour=lambda name, state: times)
+        return together_lines(["drug"], ExchangePlan(transport), 1.0, None)
+
+    words = lines(1e3)[1]
+    assert "in parts of a step while cells take over 2 % of it in one, or 4 % leave and" in words
+    assert "in parts" not in " ".join(lines(100.0))
 
 
 @pytest.mark.parametrize("batches", [[[0, 1, 2, 3, 4]], [[1, 3], [0, 2, 4]]])

@@ -74,6 +74,7 @@ def test_what_a_source_gives_is_exact_for_each_colony(more):
 
 
 @pytest.mark.parametrize("backend", ["compiled", "torch"])
+@pytest.mark.filterwarnings("ignore:.* find a reservoir without it")
 @pytest.mark.parametrize("where", ["face", "open", "flow", "reservoir", "source"])
 def test_a_schedule_is_a_run_in_pieces(where, backend):
     scheduled = grown(medium(tf.Schedule(PULSE), where, backend=backend))

@@ -29,7 +29,7 @@ SETS = {
     "γ = 1": (2, {"length_drag": 1.0, "viscosity": 0.1}, 0.1),
     "γ = 10⁴": (2, {"length_drag": 1e4}, 1e-5),
     "γ = 10⁴ in space": (3, {"length_drag": 1e4, "passes": 4}, 1e-5),
-    "a drag for each cell": (2, {"length_drag": tf.LogNormal(100.0, 1.0)}, 1e-5),
+    "a drag for each cell": (2, {"viscosity": tf.LogNormal(1.0, 1.0)}, 1e-5),
     "α of the paper": (2, {"alpha": 0.1, "passes": 6, "overlap": 0.01}, 0.1),
     "nearly hard": (3, {"alpha": 1e-4}, 1e-4),
     "between agarose and coverslip": (3, {"walls": FILM}, 0.01),
