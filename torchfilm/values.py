@@ -308,13 +308,8 @@ Value = float | Tensor | np.ndarray | Sequence[float] | Mapping[int, Any] | Dist
 ScheduledValue = Value | Schedule
 
 
-def quotient(number: float, name: str, value: Any) -> Any:
-    """number / value, given in the way that the value is. Raises InputError for a drawn value."""
-    if isinstance(value, ByType):
-        return {kind: quotient(number, f"{name}[{kind}]", v) for kind, v in value.values.items()}
+def quotient(number: float, value: Any) -> Any:
+    """number / value, given in the way that the value is, one number or one per colony."""
     if isinstance(value, PerColony):
         return PerColony(number / torch.as_tensor(value.values))
-    if isinstance(value, Distribution):
-        allowed = "a value that is not drawn, where the settings set a penalty"
-        raise checks.input_error(name, value, allowed, "Leave the penalty out of the settings.")
     return number / value

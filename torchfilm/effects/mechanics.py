@@ -383,7 +383,7 @@ class Mechanics(Effect):
                 "overlap": close if self.overlap is None else self.overlap,
             }
         if settings.penalty is not None and self.stiffness is None:
-            changed["alpha"] = quotient(settings.penalty, "Mechanics.length_drag", self.length_drag)
+            changed["alpha"] = quotient(settings.penalty, self.length_drag)
         return replace(self, **changed) if changed else self
 
     def _one_sided_with(self, settings: Any) -> Mechanics:
