@@ -271,15 +271,6 @@ def test_sixty_founders_look_different():
     assert colours_by_number(np.empty(0, np.int64)).shape == (0, 3)
 
 
-def test_a_quantity_that_is_called_founder_is_drawn_as_it_is(tmp_path):
-    cells = tf.Cells([[0.0, 0.0], [3.0, 0.0]], [[0.0, 1.0]] * 2, 2.0, extra={"founder": [7.5, 3.0]})
-    scene = tf.Scene(tf.Growth(rate=0.5), tf.Mechanics(dim=2), founders=cells, dt=0.1)
-    list(tf.simulate(scene, until=0.1, record=tmp_path / "run.h5"))
-    with tf.Results(tmp_path / "run.h5") as results:
-        (frame,) = RecordedFrames(results, [0], asked=["founder"])
-    assert frame.cells["founder"].tolist() == [7.5, 3.0]
-
-
 def test_volumes_and_ages_are_drawn_where_they_are_asked_for(tmp_path):
     """As tables have them, in frames and in what is drawn over time."""
     path = tmp_path / "run.h5"
@@ -313,11 +304,12 @@ def test_volumes_and_ages_are_drawn_where_they_are_asked_for(tmp_path):
     tf.show(state, colour="volume")
 
 
-def test_a_quantity_that_is_called_age_is_drawn_as_it_is(tmp_path):
-    cells = tf.Cells([[0.0, 0.0], [3.0, 0.0]], [[0.0, 1.0]] * 2, 2.0, extra={"age": [7.5, 3.0]})
+@pytest.mark.parametrize("name", ["founder", "age"])
+def test_a_quantity_with_the_name_of_a_colour_is_drawn_as_it_is(tmp_path, name):
+    cells = tf.Cells([[0.0, 0.0], [3.0, 0.0]], [[0.0, 1.0]] * 2, 2.0, extra={name: [7.5, 3.0]})
     scene = tf.Scene(tf.Growth(rate=0.5), tf.Mechanics(dim=2), founders=cells, dt=0.1)
     list(tf.simulate(scene, until=0.1, record=tmp_path / "run.h5"))
     with tf.Results(tmp_path / "run.h5") as results:
-        (frame,) = RecordedFrames(results, [0], asked=["age"])
-        (_, known), _ = known_quantities(results, "age")
-    assert frame.cells["age"].tolist() == known["age"].tolist() == [7.5, 3.0]
+        (frame,) = RecordedFrames(results, [0], asked=[name])
+        (_, known), _ = known_quantities(results, name)
+    assert frame.cells[name].tolist() == known[name].tolist() == [7.5, 3.0]

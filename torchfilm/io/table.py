@@ -123,7 +123,7 @@ def _of_cells(
         **_pose(found["position"], found["axis"], internals),
         "length": found["length"],
         "radius": found["radius"],
-        "volume": _volume(found["length"], found["radius"]),
+        "volume": volumes(found["length"], found["radius"]),
     }
 
 
@@ -148,7 +148,8 @@ def _pose(position: np.ndarray, axis: np.ndarray, internals: bool) -> dict[str, 
     return columns
 
 
-def _volume(length: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def volumes(length: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Volume of each cell, (N,) µm³, from its length and radius, µm."""
     return capsule.volume(torch.from_numpy(length), torch.from_numpy(radius)).numpy()
 
 

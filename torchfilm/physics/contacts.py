@@ -21,9 +21,9 @@ from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_s
 # Sine of the angle between two axes at which a line of contact has shrunk to a point (see
 # `line_points`).
 LINE_CONTACT_SINE = 0.4
-# Where centrelines cross, the nearer end of a line of contact lies at most CROSSED times their
-# distance to its side, so that cells are there at most 2 % farther apart than at it. Where
-# it was as far aside as they are apart, nothing parted rods of 12 µm that were 0.15 µm deep.
+# Where centrelines cross, the nearer end of a line of contact lies to the side of the crossing by
+# at most CROSSED times their distance, so that cells are there at most 2 % farther apart. Where it
+# was as far aside as they are apart, nothing parted rods of 12 µm that were 0.15 µm deep.
 CROSSED = 0.2
 
 

@@ -9,14 +9,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch
 
 from torchfilm.io.identity import walls_of
 from torchfilm.io.layout import OBSTACLES
 from torchfilm.io.lineage import Lineage
 from torchfilm.io.parameters import column_names
 from torchfilm.io.results import Results
-from torchfilm.physics import capsule
+from torchfilm.io.table import volumes
 from torchfilm.pictures.categories import colours_by_number
 from torchfilm.scene import Scene
 from torchfilm.state import CELL, PER_CELL, State
@@ -65,7 +64,8 @@ class Frame:
         """The frame, with the volumes of its cells where they are among `names`."""
         if VOLUME not in names or VOLUME in self.cells:
             return self
-        return replace(self, cells={**self.cells, VOLUME: volumes(self.cells)})
+        volume = volumes(self.cells["length"], self.cells["radius"])
+        return replace(self, cells={**self.cells, VOLUME: volume})
 
     def name(self, place: int) -> str:
         """What a title calls the colony at this index of the batch."""
@@ -88,12 +88,6 @@ class Frame:
         """The cells of one colony, by its index in the batch."""
         part = slice(self._ends[place], self._ends[place + 1])
         return {name: value[part] for name, value in self.cells.items()}
-
-
-def volumes(cells: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Volume of each cell, (N,) float64, µm³."""
-    size = (torch.from_numpy(cells[n].astype(float)) for n in ("length", "radius"))
-    return capsule.volume(*size).numpy()
 
 
 def of_lineage(

@@ -13,9 +13,10 @@ import torch
 from torchfilm.io.blocks import blocks
 from torchfilm.io.identity import declared_fields
 from torchfilm.io.results import Results
+from torchfilm.io.table import volumes
 from torchfilm.pictures.colours import MEAN, PlotStyle, checked_range, scale_of
 from torchfilm.pictures.figures import check_not_results, opened
-from torchfilm.pictures.frames import AGES, VOLUME, of_lineage, unit_of, volumes
+from torchfilm.pictures.frames import AGES, VOLUME, of_lineage, unit_of
 from torchfilm.pictures.page import checked_dpi
 from torchfilm.pictures.picture import Picture, new_figure
 from torchfilm.pictures.scales import Scale, ValueRange
@@ -127,7 +128,7 @@ def _seen(
     position, value = cells["position"][mine], known[quantity][mine].astype(float)
     if along != "radius":
         return position[:, "xyz".index(along)], value
-    volume = volumes({n: cells[n][mine] for n in ("length", "radius")})[:, None]
+    volume = volumes(*(cells[n][mine].astype(float) for n in ("length", "radius")))[:, None]
     centre = (volume * position).sum(0) / volume.sum() if len(position) else 0.0
     return np.hypot(*(position - centre)[:, :2].T), value
 
@@ -142,7 +143,7 @@ def known_quantities(results: Results, *wanted: str) -> Iterator[tuple[Columns, 
         known = {n: x for n, x in cells.items() if x.ndim == 1 and n not in hidden}
         known |= {OUTSIDE + n: x for n, x in signals.items()}
         if VOLUME in wanted and VOLUME not in known:
-            known[VOLUME] = volumes(cells)
+            known[VOLUME] = volumes(cells["length"], cells["radius"])
         if asked := [n for n in AGES if n in wanted and n not in known]:
             times = results.times[block.frames][block.which]
             known |= of_lineage(tree or (tree := results.lineage()), ids, cells, times, asked)
