@@ -8,6 +8,7 @@ import torch
 from helpers import run, seeded, step
 
 import torchfilm as tf
+from torchfilm.kernels.scheme import OVERLAP
 from torchfilm.physics import contact_step
 from torchfilm.physics.contact_records import CellProperties, Moved
 from torchfilm.physics.contact_search import find_contacts, unresolved_contacts
@@ -399,3 +400,22 @@ def test_sub_steps_take_off_no_growth():
     wanted = volume(0.0125)
     assert volume(0.025, max_elongation=0.05) == pytest.approx(wanted, rel=0.02)
     assert volume(0.05) == pytest.approx(wanted, rel=0.05)
+
+
+@pytest.mark.parametrize("backend", ["torch", "compiled"])
+@pytest.mark.parametrize("width", [1.0, 1.02])
+def test_light_walls_leave_cells_no_deeper_in_each_other_than_wanted(width, backend):
+    """Of the contacts in a channel one cell wide most are those with its sides, and light. By the
+    mean of all contacts alone the cells would lie three times as deep in each other."""
+    scene = tf.Scene(
+        tf.Growth(rate=1.0),
+        tf.Division(length=tf.Uniform(3.5, 4.5)),
+        tf.Mechanics([tf.Channel(width, low_end=0.0)], dim=2, length_drag=1e4, backend=backend),
+        tf.Removal(low=(-1.0, -width), high=(15.0, width)),
+        founders=tf.Cells([[2.0, 0.0], [6.0, 0.0], [10.0, 0.0]], [[1.0, 0.0]] * 3),
+        dt=0.025,
+    )
+    states = list(tf.simulate(scene, until=2.5, colonies=4, seed=1))[-40::4]
+    found = torch.stack([tf.measure.overlaps(state).mean for state in states]).mean()
+    wanted = 0.5 * OVERLAP
+    assert 0.7 * wanted < found < 1.1 * wanted

@@ -11,7 +11,9 @@ contacts are as hard as leaves a small mean overlap, at any drag and any pressur
 # most MARGIN away from its last move, or from that part of it that the cell still has (its point
 # nearest to the move: else cells that were fast would coast where growth ends, and 7 % of a channel
 # would leave); a pass is repeated where cells lie deeper than TOO_DEEP; contacts are as hard as
-# leaves a mean overlap of OVERLAP.
+# leaves a mean overlap of OVERLAP, of all contacts and of those between cells. (In a channel one
+# cell wide most contacts are those with its sides, and light: by the mean of all alone, its cells
+# would lie three times as deep in each other.)
 MARGIN, TOO_DEEP, OVERLAP = 0.6, 0.2, 0.014
 # Where a larger mean overlap is wanted, too deep is DEEPER times that, up to DEEPEST: else passes
 # would part in each step what the first one leaves as wanted.

@@ -248,7 +248,7 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
             break
         if error <= tolerance and number == 0 and not given:
             report[ALPHA] = before = kept_alpha if failed else hardness[0]  # of this solve
-            hardness[0] = before if failed else _following(e, rows[4], before, target, limits)
+            hardness[0] = before if failed else _following(e, rows, before, target, limits)
             if hardness[0] < LAG * before and not failed:  # the force has grown: solve again
                 put(y, kept)
                 held, kept_alpha, rising = error, before, False
@@ -346,23 +346,25 @@ def _of_colony(base, growth, radius, drag, settings):
 
 
 @lean
-def _following(e, soft, hardness, target, limits):
-    """α at which the mean overlap of the contacts that push, with cells and with hard walls, is
-    `target`, µm, and that of the eighth powers at most the third of the limits: harder at once,
-    softer by a factor of two a step. Rows at the ends of stretches do not count: they push little,
-    and would make the mean of the others larger."""
-    total, count, peaks = 0.0, 0, 0.0
+def _following(e, rows, hardness, target, limits):
+    """α at which the mean overlap of the contacts that push, all of them and those between cells,
+    is at most `target`, µm, and that of the eighth powers the third of the limits: harder at once,
+    softer by a factor of two a step. Rows at the ends of stretches do not count."""
+    total, count, peaks, between, pairs = 0.0, 0, 0.0, 0.0, 0
     softest, hardest, most = limits
     for r in range(e.shape[0]):
-        pushes = (e[r] < 0) & (soft[r] == HARD)
-        total -= e[r] if pushes else 0.0  # without branches: their outcome is not foreseen
-        part = (e[r] / most) ** 2 if pushes else 0.0
+        pushes = (e[r] < 0) & (rows[4][r] == HARD)
+        own = -e[r] if pushes else 0.0  # without branches: their outcome is not foreseen
+        total += own
+        between += own if rows[3][r] >= 0 else 0.0
+        pairs += pushes & (rows[3][r] >= 0)
+        part = (own / most) ** 2
         part *= part
         peaks += part * part
         count += pushes
     wanted = softest
     if count:
-        force = total / count / hardness
+        force = max(total / count, between / max(pairs, 1)) / hardness
         peak = math.sqrt(math.sqrt(math.sqrt(max(peaks / count, 1e-300))))
         if force > 0:
             wanted = min(wanted, target / force, hardness / peak)

@@ -368,9 +368,8 @@ class _OneStep:
         return ContactProblem(rows, gap, applied, alphas, low, scale, rigid, self.groups)
 
     def _followed(self, hardness: Tensor, problem, after: Tensor, contacts, walls) -> Tensor:
-        """α of each colony at which the mean overlap of its contacts, with cells and hard walls, is
-        the target, and that of the eighth powers at most a share of what is too deep: harder at
-        once, softer by a factor of two a step. Rows at the ends of stretches do not count."""
+        """α of each colony at which the mean overlap of contacts, all and those between cells, is
+        at most the target: see `kernels.step._following`. `after`: each row's gap."""
         root, soft = self._wall_roots(walls, torch.ones_like(self.given.radius))
         hard = torch.cat([~contacts.beside, ~soft & (root >= 1)])  # all: the first pass moves all
         overlap = torch.where(hard, -after, 0.0).clamp(min=0.0).double()
@@ -378,10 +377,12 @@ class _OneStep:
         powers = overlap / most.index_select(0, problem.of_rows.owner)
         for _ in range(3):
             powers = powers * powers
-        each = torch.stack([overlap, (overlap > 0).double(), powers], 1)
-        total, count, peaks = problem.of_rows.sum(each).unbind(1)
-        count = count.clamp(min=1)
-        force = total / count / hardness
+        of_pairs = torch.cat([overlap[: len(contacts.gap)], torch.zeros_like(walls.gap)])
+        some = ((x > 0).double() for x in (overlap, of_pairs))
+        each = torch.stack([overlap, of_pairs, *some, powers], 1)
+        total, between, count, pairs, peaks = problem.of_rows.sum(each).unbind(1)
+        count, pairs = count.clamp(min=1), pairs.clamp(min=1)
+        force = torch.maximum(total / count, between / pairs) / hardness
         pushes = force > 0
         wanted = self.target / torch.where(pushes, force, 1.0)
         peak = torch.where(pushes, peaks / count, 1.0).clamp(min=1e-300)
