@@ -45,6 +45,14 @@ def test_a_profile_is_the_mean_of_each_bin():
     assert below[0].tolist() == pytest.approx([7.0, 5.0, 3.0, 1.0])
 
 
+@pytest.mark.parametrize("name", ["length", "radius", "volume"])
+def test_sizes_of_cells_have_profiles(name):
+    rods = tf.Cells(lattice(8), np.array([1.0, 0.0]), np.linspace(1.0, 3.0, 64), 0.4)
+    state = tf.Scene(tf.Growth(rate=1.0), dim=2).bind(cells=rods, dtype=torch.float64).start()
+    found = tf.measure.profile(state, name, EDGES)
+    assert found[0].tolist() == pytest.approx(getattr(state, name).view(4, 16).mean(1).tolist())
+
+
 def test_signals_at_cells_have_profiles():
     scene = tf.Scene(
         tf.Medium(

@@ -20,8 +20,9 @@ EQUAL = 1e-20  # a variance, relative to the mean square, that roundings of many
 
 
 def quantity(measure: str, state: State, name: object) -> Tensor:
-    """One number for each cell, (N,) float64: a field, a signal at the cells as "out.NAME", or the
-    numbers themselves. Raises InputError, which names the measure, for anything else."""
+    """One number for each cell, (N,) float64: a field, "length", "radius", "volume", a signal at
+    the cells as "out.NAME", or the numbers themselves. Raises InputError, which names the measure,
+    for anything else."""
     if isinstance(name, Tensor):
         if name.shape != (state.cells,) or name.is_complex():
             rule = f"({state.cells},), one number for each cell"
@@ -31,7 +32,7 @@ def quantity(measure: str, state: State, name: object) -> Tensor:
     fields = [n for n, f in state.declared.items() if f.scope == CELL and not f.internal]
     known = {n: state.fields[n] for n in fields if state.fields[n].dim() == 1}
     known |= {} if contact is None else {OUTSIDE + n: x for n, x in contact.found.items()}
-    known |= {"length": state.length, "radius": state.radius}
+    known |= {"length": state.length, "radius": state.radius, "volume": state.volume}
     if not isinstance(name, str) or name not in known:
         raise checks.input_error(f"{measure}(name)", name, "one of " + ", ".join(map(repr, known)))
     return known[name].double()

@@ -23,10 +23,11 @@ def profile(
     """The mean of a quantity over the cells of each colony in bins along a coordinate, (B, K)
     float64; NaN in a bin without cells.
 
-    name: a field of the cells, a signal at them as "out.NAME", or numbers, (N,). edges: of the
-    bins, K + 1 of them, µm, ascending; a bin has its lower edge, not its upper one. along: "x",
-    "y", "z", "radius" from the colony's centre (of volume) in the x–y plane, "edge" as
-    `below_edge` and "top" as `below_top` have it, or a coordinate of your own, (N,)."""
+    name: a field of the cells, "length", "radius", "volume", a signal at them as "out.NAME", or
+    numbers, (N,). edges: of the bins, K + 1 of them, µm, ascending; a bin has its lower edge, not
+    its upper one. along: "x", "y", "z", "radius" from the colony's centre (of volume) in the x–y
+    plane, "edge" as `below_edge` and "top" as `below_top` have it, or a coordinate of your own,
+    (N,)."""
     value, limits = quantity("profile", state, name), checked_edges("profile", edges)
     return binned_mean(state.groups, value, place_along("profile", state, along), limits)
 
