@@ -4,6 +4,7 @@ paper's equations 1–4)."""
 from __future__ import annotations
 
 import copy
+import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -262,22 +263,7 @@ class Mechanics(Effect):
         return found
 
     def declares(self, dim: int) -> tuple[Field, ...]:
-        meaning = (
-            "move of the last first solve of a step or sub-step (Δc, Δθ, Δl), from which the next"
-            " starts"
-        )
-        shape = (self.settings.degrees,)
-        move = Field("displacement", meaning, "µm, rad, µm", shape=shape, internal=True)
-        # what a colony has, its cells have, so that growth can be recorded for other designs
-        meaning = "steps in a row in which contacts have not held the colony's cells apart"
-        collapsed = Field("collapsed_steps", meaning, dtype=torch.int64, internal=True)
-        if not self.one_sided:
-            return move, collapsed
-        meaning = "α with which the next step of the colony's contacts begins, 0 before the first"
-        alpha = Field("contact_alpha", meaning, "1/μ/µm", internal=True)
-        meaning = "how much shorter pressure has made a cell than it once was"
-        compression = Field("compression", meaning, "µm", at_division="reset", internal=True)
-        return move, collapsed, alpha, compression
+        return _fields(self.settings.degrees, self.one_sided)
 
     @property
     def _own_fields(self) -> tuple[str, ...]:
@@ -417,3 +403,20 @@ def _checked(part: Any) -> Any:
             label = f"{type(part).__name__}.{name}"
             object.__setattr__(own, name, checked(label, given, rule))
     return own
+
+
+@functools.cache
+def _fields(degrees: int, one_sided: bool) -> tuple[Field, ...]:
+    """What mechanics keep of the cells from step to step."""
+    meaning = "move of the last first solve (Δc, Δθ, Δl), from which the next one starts"
+    move = Field("displacement", meaning, "µm, rad, µm", shape=(degrees,), internal=True)
+    # what a colony has, its cells have, so that growth can be recorded for other designs
+    meaning = "steps in a row in which contacts have not held the colony's cells apart"
+    collapsed = Field("collapsed_steps", meaning, dtype=torch.int64, internal=True)
+    if not one_sided:
+        return move, collapsed
+    meaning = "α with which the next step of the colony's contacts begins, 0 before the first"
+    alpha = Field("contact_alpha", meaning, "1/μ/µm", internal=True)
+    meaning = "how much shorter pressure has made a cell than it once was"
+    compression = Field("compression", meaning, "µm", at_division="reset", internal=True)
+    return move, collapsed, alpha, compression

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import torch
 from torch import Tensor
 
+from torchfilm.tools.call_fits import CallFits
 from torchfilm.tools.one_per_colony import Value as Value
 from torchfilm.tools.one_per_colony import as_tensor
 from torchfilm.tools.warn_once import SMALL_SPECIES as SMALL_SPECIES  # public, for searches
@@ -94,11 +95,12 @@ def unknown_keyword(
 def known_keywords(function: F, instead: Mapping[str, str] | None = None) -> F:
     """Let a function raise InputError, with the nearest name, for a keyword that it does not take,
     and for an argument that is missing. instead: as in `unknown_keyword`."""
-    signature = inspect.signature(function)
+    call = CallFits(inspect.signature(function))
 
     @functools.wraps(function)
     def checked(*args: Any, **given: Any) -> Any:
-        check_call(function.__name__, signature, args, given, instead)
+        if not call.fits(args, given):
+            check_call(function.__name__, call.signature, args, given, instead)
         return function(*args, **given)
 
     return cast(F, checked)
@@ -190,15 +192,18 @@ class KnownKeywords(abc.ABCMeta):
     if not TYPE_CHECKING:  # type checkers see what each class takes, and makes
 
         def __call__(cls, *args: Any, **given: Any) -> Any:
-            check_call(cls.__name__, cls._known(), args, given, cls.instead, cls.unnamed)
+            call = cls._call()
+            if not call.fits(args, given):
+                named = cls.instead, cls.unnamed
+                check_call(cls.__name__, call.signature, args, given, *named)
             default_device()
             return super().__call__(*args, **given)
 
-    def _known(cls) -> inspect.Signature:
+    def _call(cls) -> CallFits:
         """Of this class, worked out once."""
-        if "_signature" not in cls.__dict__:
-            cls._signature = inspect.signature(cls)
-        return cls.__dict__["_signature"]
+        if "_own_call" not in cls.__dict__:
+            cls._own_call = CallFits(inspect.signature(cls))
+        return cls.__dict__["_own_call"]
 
     @property
     def __signature__(cls) -> inspect.Signature:
