@@ -224,11 +224,13 @@ def _warnings(report: SearchReport) -> list[str]:
 def _same_losses(report: SearchReport) -> str:
     """That no parameter made a difference; else ""."""
     each = [e.losses.reshape(len(e.losses), -1) for e in report.study.entries if e.size == 1]
-    seeds = min((x.shape[1] for x in each), default=0)  # a model of the loss may have fewer
-    every = np.concatenate([x[:, :seeds] for x in each]) if each else np.zeros((0, 1))
-    if report.task.goals or len(every) < ALIKE or every.max() >= report.task.target.failed:
+    seeds = max((x.shape[1] for x in each), default=0)  # some designs may have fewer
+    by_seed = [np.concatenate([x[:, k] for x in each if x.shape[1] > k]) for k in range(seeds)]
+    every = by_seed[0] if by_seed else np.zeros(0)
+    failed = report.task.target.failed
+    if report.task.goals or len(every) < ALIKE or max(x.max() for x in by_seed) >= failed:
         return ""
-    if (np.ptp(every, axis=0) > DIFFERENT * np.abs(every).max(0)).any():
+    if any(np.ptp(x) > DIFFERENT * np.abs(x).max() for x in by_seed):
         return ""
     names = " or ".join(report.task.space.names)
     return (

@@ -44,11 +44,12 @@ class Stripe(ProfileTarget):
     is that to the nearest cell of the other type, from centre to centre, less a cell's diameter, 0
     where cells overlap. True, the border is one straight line, at the place along the axis with the
     fewest cells on the wrong side. along: "x" or "y", the axis that the stripe lies across.
-    cell_type: only cells of this type count. place: of the middle of the stripe from `at`, µm
-    towards the type that lies higher on the axis. The default is 0; with "border" and a cell_type,
-    the stripe adjoins the border on the side of that type. floor: the level from which a cell
-    counts as lit. edge_width: µm, as for `Bands`. A colony that has lost one of its two types, or
-    `cell_type`, has failed.
+    cell_type: only cells of this type count. place: of the middle of the stripe from `at`, µm along
+    the axis; from the border into the cells of `cell_type`, on either side of the others, or
+    without one into the type that lies higher on the axis. The default is 0; with "border" and a
+    cell_type, the stripe adjoins the border on the side of that type. floor: the level from which
+    a cell counts as lit. edge_width: µm, as for `Bands`. A colony that has lost one of its two
+    types, or `cell_type`, has failed.
     """
 
     species: str
@@ -153,11 +154,11 @@ class Stripe(ProfileTarget):
             away = offset(state, (float(self.at),) * 2)[:, "xy".index(self.along)]
             return at, torch.full_like(at, place), away
         at, low_type = border(state, self.along)
-        middle = torch.full_like(at, place)
         if self.place is None and self.cell_type is not None:
-            middle = torch.where(
-                low_type == self.cell_type, -0.5 * self.width, 0.5 * self.width
-            ).double()
+            place = 0.5 * self.width
+        middle = torch.full_like(at, place)
+        if self.cell_type is not None:  # into the cells of this type
+            middle = torch.where(low_type == self.cell_type, -middle, middle)
         return (
             at,
             middle,

@@ -32,7 +32,7 @@ from design import (
     Weighted,
 )
 from design.finals import FreshLosses
-from design.report import table
+from design.report import _same_losses, table
 from design.report_plot import draw
 from design.trivial import BRIGHT, LEVELS, trivial_losses
 
@@ -472,3 +472,13 @@ def test_a_marker_lies_at_the_option_that_is_used():
     for line in axes.lines[:2]:
         x, y = line.get_data()
         assert float(x[int(np.argmin(y))]) == 0.75
+
+
+@pytest.mark.parametrize("second, alike", [(0.7, True), (0.2, False)])
+def test_parameters_make_no_difference_only_where_they_make_none_on_any_seed(second, alike):
+    """Ten designs on one seed, then four on two, as polishing leaves them."""
+    losses = [np.full((10, 1), 1.0), np.array([[1.0, 0.7]] * 3 + [[1.0, second]])]
+    task = SimpleNamespace(goals=(), target=Level("gfp"), space=SimpleNamespace(names=["make"]))
+    study = SimpleNamespace(entries=[SimpleNamespace(size=1, losses=x) for x in losses])
+    report = SimpleNamespace(task=task, study=study, best=SimpleNamespace(loss=0.7))
+    assert ("depends on make" in _same_losses(report)) == alike

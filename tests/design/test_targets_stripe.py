@@ -124,7 +124,9 @@ def test_a_stripe_of_one_type_adjoins_the_border_on_its_side(turned, low):
         ({}, -3, 3),
         ({"place": 2.0}, -1, 5),
         ({"place": 0.0, "cell_type": 1}, -3, 3),
-        ({"place": -4.0, "cell_type": 0}, -7, -1),
+        ({"place": 4.0, "cell_type": 0}, -7, -1),  # into the cells of that type
+        ({"place": 4.0, "cell_type": 1}, 1, 7),
+        ({"place": -4.0, "cell_type": 1}, -7, -1),
         ({"at": 10.0}, 2, 8),  # 5 µm from the border
         ({"at": 10.0, "place": 1.0, "cell_type": 1}, 3, 9),
     ],
@@ -315,3 +317,16 @@ def test_a_stripe_that_winds_is_the_same_in_any_batch():
     two = placed(places, cell_type=kinds, colony=[0] * state.cells + [1, 1], colonies=2, yfp=1.0)
     assert torch.equal(target.loss(two)[:1], target.loss(state))
     assert float(target.loss(two)[1]) == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("lean", [-0.4, 0.4])
+def test_a_stripe_apart_from_the_border_lies_on_both_sides_of_cells_in_the_middle(lean):
+    """By which type lies higher on the axis, chance would tell on which side it is wanted."""
+    x = np.arange(-20.0, 20.0) + 0.5
+    middle = np.abs(x) < 4
+    state = row(x + lean * ~middle, cell_type=np.where(middle, 0, 1), yfp=1.0)
+    target = Stripe("yfp", width=6.0, place=8.0, cell_type=1, edge_width=SHARP)
+    # 1 µm from a cell at 3.5 to the next at 4.5, which touches it
+    away = np.abs(x + lean * np.where(middle, 0, 1)) - 3.5 - 1.0
+    wanted = ~middle & (away > 5) & (away < 11)
+    assert target.target_profile(state)[~middle, 0].tolist() == wanted[~middle].tolist()
