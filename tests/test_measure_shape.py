@@ -196,3 +196,15 @@ def test_the_depth_of_a_colony_is_from_its_lowest_end_to_its_highest():
         length=[2.0, 4.0, 1.0], radius=0.5, colony=[0, 0, 1],
     )  # fmt: skip
     assert tf.measure.depth(state).tolist() == pytest.approx([8.0, 1.8])
+
+
+@pytest.mark.parametrize("length", [0.0, 0.7, 2.0])
+def test_the_outline_of_one_cell_has_the_second_moments_of_a_capsule(length):
+    """By quadrature over discs across the cell; a ball has a circle."""
+    r = 0.5
+    x = (np.arange(200_000) + 0.5) / 200_000 * (length + 2 * r) - length / 2 - r
+    disc = r * r - np.clip(np.abs(x) - length / 2, 0, None) ** 2  # of squared radius, at x
+    along, across = np.average(x * x, weights=disc), np.average(disc / 4, weights=disc)
+    cells = tf.Cells([[3.0, 1.0]], [[0.6, 0.8]], length=length, radius=r)
+    found = tf.measure.outline(tf.Scene(tf.Growth(rate=1.0), dim=2).bind(cells=cells).start())
+    assert found.half_axes[0].tolist() == pytest.approx([2 * along**0.5, 2 * across**0.5], rel=1e-6)

@@ -74,8 +74,9 @@ def outline_of(measure: str, state: State) -> Outline:
     """See `measure.outline`. measure: the name for messages.
 
     A filled ellipse with half-axes a and b has the variances a²/4 and b²/4 of places along them.
-    The covariance is that of all points of the cells, each a rod of length ℓ + 2r: that of the
-    cells' centres, weighted by volume, plus (ℓ + 2r)²/12 along each cell and r²/4 across.
+    The covariance is that of all points of the cells: that of their centres, weighted by volume,
+    plus that of each capsule, whose cylinder has ℓ²/12 along it and r²/4 across, and whose caps
+    have ℓ²/4 + 3ℓr/8 + r²/5 and r²/5.
     """
     check_flat_space(measure, state)
     w, groups = state.volume.double().unsqueeze(1), state.groups
@@ -83,10 +84,13 @@ def outline_of(measure: str, state: State) -> Outline:
     centre = mean_of(state.position[:, :2].double())
     x = state.position[:, :2].double() - centre.index_select(0, state.colony)
     axis, radius = state.axis[:, :2].double(), state.radius.double()
-    along = (state.length.double() + 2 * radius).square() / 12 - radius.square() / 4
+    length, caps = state.length.double(), 4 / 3 * radius  # volumes over π r²
+    across = (length / 4 + caps / 5) * radius.square() / (length + caps)
+    end = length.square() / 4 + 3 / 8 * length * radius + radius.square() / 5
+    along = (length * length.square() / 12 + caps * end) / (length + caps) - across
     pairs = lambda v: torch.stack([v[:, 0] * v[:, 0], v[:, 0] * v[:, 1], v[:, 1] * v[:, 1]], 1)
     each = pairs(x) + along.unsqueeze(1) * pairs(axis)
-    each = each + (radius.square() / 4).unsqueeze(1) * each.new_tensor([1.0, 0.0, 1.0])
+    each = each + across.unsqueeze(1) * each.new_tensor([1.0, 0.0, 1.0])
     xx, xy, yy = mean_of(each).unbind(1)
     mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
     spread = _length(half, xy)
