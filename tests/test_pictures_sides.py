@@ -11,10 +11,11 @@ from drawn import frame, ramp
 import torchfilm as tf
 
 pytest.importorskip("matplotlib")
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from torchfilm.pictures.colours import PlotStyle
-from torchfilm.pictures.draw import add_faces, add_obstacles, add_walls
+from torchfilm.pictures.draw import add_faces, add_obstacles, add_walls, set_window
 from torchfilm.pictures.frames import _solid
 from torchfilm.pictures.page import plan_layout, signal_section, solid_section
 from torchfilm.pictures.shapes import span_of_faces, with_images
@@ -103,3 +104,21 @@ def test_images_beyond_faces_are_a_period_away_and_boxes_go_from_face_to_face():
     covered = np.array([[-1.0, -2.0], [3.0, 4.0]])
     assert span_of_faces(faces, covered, "xz").tolist() == [[-10.0, -2.0], [10.0, 4.0]]
     assert span_of_faces({"z": (0.0, 9.0)}, covered, "xz").tolist() == [[-1.0, 0.0], [3.0, 9.0]]
+
+
+def test_a_wall_at_any_side_of_the_window_is_seen():
+    """Half of a thin line at an edge may be no pixel: at the top and at the left there was none."""
+    fig = Figure(figsize=(2.0, 2.0), dpi=100)
+    ax = fig.add_axes((0.1, 0.1, 0.8, 0.8))
+    ax.set_axis_off()
+    set_window(ax, (0.0, 10.0, 0.0, 10.0))
+    sides = [((1, 0), 0.0), ((-1, 0), -10.0), ((0, 1), 0.0), ((0, -1), -10.0)]
+    walls = [{"normal": [*n, 0], "offset": o, "soft": False} for n, o in sides]
+    add_walls(ax, walls, 0, "xy")
+    canvas = FigureCanvasAgg(fig)
+    canvas.draw()
+    pixels = np.asarray(canvas.buffer_rgba())[:, :, 2].astype(int)  # of blue: walls are brown
+    middle = pixels[100, :].tolist(), pixels[:, 100].tolist()
+    for line in middle:
+        assert min(line[15:25]) < 160 and min(line[175:185]) < 160
+        assert min(line[30:170]) == 255 and min(line[:15]) == 255 and min(line[185:]) == 255

@@ -245,3 +245,17 @@ def test_what_is_read_and_not_declared_is_found(monkeypatch):
     wrong, _ = undeclared(model, model.start())
     parts = ("reads length", "reads radius")
     assert wrong == [f"undeclared {part}" for part in parts]
+
+
+def test_what_mechanics_keep_has_the_meanings_that_files_have():
+    """`take_over` goes by meanings: with other words it would begin these fields anew, in silence,
+    where a run of an earlier version goes on."""
+    found = {f.name: f.meaning for f in tf.Mechanics(dim=2).declares(2)}
+    assert found == {
+        "displacement": "move of the last first solve of a step or sub-step (Δc, Δθ, Δl), from"
+        " which the next starts",
+        "collapsed_steps": "steps in a row in which contacts have not held the colony's cells apart",
+        "contact_alpha": "α with which the next step of the colony's contacts begins, 0 before the"
+        " first",
+        "compression": "how much shorter pressure has made a cell than it once was",
+    }

@@ -84,9 +84,10 @@ class Mechanics(Effect):
     bilateral ones at a length drag of about 10, where they take fewer iterations.
 
     alpha: how far contacts give way to drag. Default: one-sided contacts follow their force, so
-    that their mean overlap is contact_overlap (default 0.014 radii); bilateral ones take 0.1/γ; 1/γ
-    is the paper's. Or stiffness: μ·µm/h, physical softness of cells: α = 1/(stiffness·Δt), so that
-    a smaller Δt converges to the motion of soft cells. Both are one number, or one per colony.
+    that the mean overlap (of all, and of those between cells) is contact_overlap (0.014 radii);
+    bilateral ones take 0.1/γ; 1/γ is the paper's. Or stiffness: μ·µm/h, physical softness of cells:
+    α = 1/(stiffness·Δt), so that a smaller Δt converges to the motion of soft cells. Both are one
+    number, or one per colony.
 
     passes: at most this many a step; later ones move only the cells deeper than `overlap`, µm, and,
     if contacts are one-sided, those near them (default 0.2 radii, or up to a radius ten times
@@ -408,7 +409,11 @@ def _checked(part: Any) -> Any:
 @functools.cache
 def _fields(degrees: int, one_sided: bool) -> tuple[Field, ...]:
     """What mechanics keep of the cells from step to step."""
-    meaning = "move of the last first solve (Δc, Δθ, Δl), from which the next one starts"
+    # files and states keep meanings: with other words, `take_over` would begin the field anew
+    meaning = (
+        "move of the last first solve of a step or sub-step (Δc, Δθ, Δl), from which the next"
+        " starts"
+    )
     move = Field("displacement", meaning, "µm, rad, µm", shape=(degrees,), internal=True)
     # what a colony has, its cells have, so that growth can be recorded for other designs
     meaning = "steps in a row in which contacts have not held the colony's cells apart"

@@ -32,6 +32,8 @@ FAR = 1e6  # µm: the end of a wall that has none
 # the colour outside the box of a signal: not grey, so that nobody reads it as a concentration
 OUTSIDE_BOX = "#efe4d2"
 OBSTACLE = "#d2b48c"
+# How far lines at the edges of the axes are seen beyond them, in sizes of the axes.
+BEYOND = 0.006
 SMALL, TINY = 7.0, 6.0  # points
 ROUND = 0.05  # inches of a radius above which an outline of few points has visible corners
 
@@ -267,7 +269,7 @@ def add_walls(ax: Axes, walls: Sequence[Mapping[str, Any]], colony: int, view: s
         if "radius" in wall:
             centre = tuple(own(wall["centre"][k]) for k in seen)
             round_wall = {"fill": False, "linestyle": dashes(wall), **style}
-            ax.add_patch(Circle(centre, own(wall["radius"]), **round_wall))
+            _whole_at_edges(ax, ax.add_patch(Circle(centre, own(wall["radius"]), **round_wall)))
             continue
         normal = np.array([own(wall["normal"][k]) for k in seen])
         if np.hypot(*normal) > 1.0 - 1e-6:
@@ -275,7 +277,7 @@ def add_walls(ax: Axes, walls: Sequence[Mapping[str, Any]], colony: int, view: s
     for k, (normal, offset, dash) in enumerate(flat):
         others = [(n, o) for j, (n, o, d) in enumerate(flat) if j != k and d == "-"]
         if (ends := _ends(normal, offset, others)) is not None:
-            ax.add_artist(Line2D(*ends.T, linestyle=dash, **style))
+            _whole_at_edges(ax, ax.add_artist(Line2D(*ends.T, linestyle=dash, **style)))
 
 
 def add_faces(ax: Axes, faces: Mapping[str, tuple[float, float]], view: str) -> None:
@@ -283,7 +285,15 @@ def add_faces(ax: Axes, faces: Mapping[str, tuple[float, float]], view: str) -> 
     style: Any = {"color": WALL, "linewidth": 0.8, "linestyle": ":", "zorder": 2, "gid": WALL}
     for k, line in zip(VIEWS[view], (ax.axvline, ax.axhline), strict=True):
         for at in faces.get("xyz"[k], ()):
-            line(at, **style)
+            _whole_at_edges(ax, line(at, **style))
+
+
+def _whole_at_edges(ax: Axes, line: Any) -> None:
+    """Show the whole width of a line at an edge of the axes, where a half might be no pixel."""
+    from matplotlib.transforms import Bbox, TransformedBbox
+
+    line.set_clip_path(None)
+    line.set_clip_box(TransformedBbox(Bbox([[-BEYOND] * 2, [1 + BEYOND] * 2]), ax.transAxes))
 
 
 def _ends(

@@ -13,7 +13,7 @@ import numpy as np
 
 from torchfilm.io.results import Results
 from torchfilm.pictures.colours import CELLS, Limits, PlotStyle, paint_cells
-from torchfilm.pictures.draw import OUTSIDE_BOX
+from torchfilm.pictures.draw import OBSTACLE, OUTSIDE_BOX, WALL
 from torchfilm.pictures.figures import (
     check_not_results,
     choose_colonies,
@@ -204,15 +204,10 @@ def _palette(film: MovieFrames) -> np.ndarray:
             for place in layout.places
         ]
     wanted = np.unique(np.round(255 * np.concatenate(colours)).astype(np.uint8), axis=0)
-    wanted = _spread(wanted, 256 - GREYS - 1)
+    own = np.round(255 * np.array([to_rgb(c) for c in (OUTSIDE_BOX, OBSTACLE, WALL)]))
+    wanted = _spread(wanted, 256 - GREYS - len(own))
     greys = np.round(np.linspace(0, 255, GREYS)).astype(np.uint8)
-    colours_used = np.concatenate(
-        [
-            np.repeat(greys[:, None], 3, 1),
-            np.round(255 * np.array([to_rgb(OUTSIDE_BOX)])).astype(np.uint8),
-            wanted,
-        ]
-    )
+    colours_used = np.concatenate([np.repeat(greys[:, None], 3, 1), own.astype(np.uint8), wanted])
     return np.concatenate([colours_used, np.zeros((256 - len(colours_used), 3), dtype=np.uint8)])
 
 
