@@ -254,7 +254,8 @@ def test_what_mechanics_keep_has_the_meanings_that_files_have():
     assert found == {
         "displacement": "move of the last first solve of a step or sub-step (Δc, Δθ, Δl), from"
         " which the next starts",
-        "collapsed_steps": "steps in a row in which contacts have not held the colony's cells apart",
+        "collapsed_steps": "steps in a row in which contacts have not held the colony's cells"
+        " apart",
         "contact_alpha": "α with which the next step of the colony's contacts begins, 0 before the"
         " first",
         "compression": "how much shorter pressure has made a cell than it once was",
