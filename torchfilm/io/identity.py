@@ -40,6 +40,18 @@ def scene_attributes(scene: Scene, model: Model | None) -> dict[str, str]:
     }
 
 
+def earlier_runs(attributes: Mapping[str, Any], now: Mapping[str, Any], frames: int) -> str:
+    """The attribute `earlier` of a file whose run goes on with the attributes `now`: what its first
+    `frames` frames ran with, {"frames", "dt", "effects": those that are others now}, for each
+    change."""
+    known = json.loads(attributes.get("earlier", "[]"))
+    kept, was = json.loads(now["effects"]), json.loads(attributes.get("effects", "null"))
+    changed = [effect for effect in was or () if effect not in kept]
+    if changed or float(attributes["dt"]) != now["dt"]:
+        known.append({"frames": frames, "dt": float(attributes["dt"]), "effects": changed})
+    return json.dumps(known)
+
+
 def walls_of(scene: Scene) -> list[dict[str, Any]]:
     """The walls of a scene as plain numbers, as in `Results.walls`."""
     return [as_data(surface) for surface in scene.wall_surfaces()]

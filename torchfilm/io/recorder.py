@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from torchfilm.io import events, replacing
-from torchfilm.io.identity import scene_attributes
+from torchfilm.io.identity import earlier_runs, scene_attributes
 from torchfilm.io.layout import (
     AT_CELLS,
     CHUNK_ROWS,
@@ -242,6 +242,7 @@ class Recorder(metaclass=checks.KnownKeywords):
             come = events.just_arrived(state, kept.next_uid())
             self.births += events.arrivals_of(come, state.replace(ended=()))
             self.written, self.first_step = int(kept.steps[-1]), int(kept.steps[0])
+            frames = len(kept)
             self.every = int(kept.attributes["every"]) if self._as_before else self.every
         check_room(
             self.target, self.target.stat().st_size, f"to resume {self.path}, by a copy of it",
@@ -251,6 +252,7 @@ class Recorder(metaclass=checks.KnownKeywords):
         replacing.copy_committed(self.target, self.file)
         # with `changed`, the scene may be another one
         ours = {**scene_attributes(self.scene, self.model), "dt": self.dt, "every": self.every}
+        ours["earlier"] = earlier_runs(self.file.attrs, ours, frames)
         for name, value in ours.items():
             self.file.attrs[name] = value
         about = self.scene, state.colony_id, state.step

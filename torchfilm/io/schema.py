@@ -87,6 +87,7 @@ ATTRIBUTES: dict[str, Callable[[Any], bool]] = {
     "periodic": _are_spans,
     "internal": _are_texts,
     "type_names": _are_texts,
+    "earlier": lambda x: isinstance(x, list) and all(isinstance(run, dict) for run in x),
     "effects": lambda x: x is None or _are_texts(x),
     "code": lambda x: x is None or isinstance(x, (list, dict, str)),
 }
