@@ -295,7 +295,7 @@ def test_every_other_frame_and_the_last(run, tmp_path, film_options):
 def test_a_gif_shows_what_was_drawn(run, tmp_path, film_options):
     """Greys are 255/103 apart, so the error of a grey pixel is 1.3 at most, rounded to 2.
 
-    The 151 other colours serve two maps, each a line of length 310 in colour space, and a few cells
+    The 149 other colours serve two maps, each a line of length 310 in colour space, and a few cells
     between them. They are about 4 apart, so no cell's error exceeds 8. Blended pixels at edges are
     in no legend.
     """
@@ -426,3 +426,24 @@ def test_an_mp4_has_every_frame(run, tmp_path, film_options):
 )
 def test_times_of_a_film_are_equally_long(times, words):
     assert clock(np.array(times, dtype=float)) == words
+
+
+def test_a_gif_keeps_the_colours_of_walls_and_obstacles(tmp_path):
+    """Beside a signal in greys they were the next grey."""
+    scene = tf.Scene(
+        tf.Growth(rate=1.0),
+        tf.Mechanics([tf.Box(low=(6.0, 1.0), high=(18.0, 9.0))], dim=2),
+        tf.Medium(
+            a=tf.Signal(50.0, initial=lambda p: p[:, 0]),
+            box=((0.0, 0.0), (32.0, 20.0)), spacing=1.0,
+            obstacles=lambda p: (p[:, 0] > 14) & (p[:, 0] < 17) & (p[:, 1] > 2) & (p[:, 1] < 4),
+        ),
+        founders=tf.Cells([[8.0, 2.0], [10.0, 8.0], [16.0, 6.0]], [[1.0, 0.0]] * 3),
+    )  # fmt: skip
+    path = tmp_path / "run.h5"
+    tf.simulate(scene, until=0.1, record=path).last()
+    tf.pictures.movie(path, tmp_path / "run.gif", background="a")
+    with Image.open(tmp_path / "run.gif") as film:
+        pixels = np.asarray(film.convert("RGB")).reshape(-1, 3)
+    for colour in ((160, 82, 45), (210, 180, 140)):
+        assert (pixels == colour).all(1).sum() > 100
