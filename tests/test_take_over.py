@@ -206,6 +206,17 @@ def test_space_is_that_of_the_scene():
     periodic = plain.replace(*plain.effects[:2], tf.Mechanics(dim=2, periodic={"x": (-20.0, 20.0)}))
     state = tf.simulate(plain, until=1.0).last()
     assert periodic.take_over(state).space == periodic.bind().start().space is not None
+    narrow = plain.replace(*plain.effects[:2], tf.Mechanics(dim=2, periodic={"x": (1.0, 41.0)}))
+    with pytest.raises(tf.InputError, match=r"cell 1 of colony 0 starts at .*, beyond the faces"):
+        narrow.take_over(state)
+
+
+def test_cells_behind_a_hard_wall_are_named():
+    plain = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2), dt=DT)
+    wall = tf.Plane(x=-5.0, facing="-x")
+    walled = plain.replace(plain.effects[0], tf.Mechanics([wall], dim=2))
+    with pytest.warns(UserWarning, match=r"cell 0 of colony 0 starts at .* behind it"):
+        walled.take_over(plain.bind().start())
 
 
 def test_names_that_rules_are_the_first_to_set(grown):

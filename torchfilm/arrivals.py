@@ -35,7 +35,7 @@ def with_arrivals(
     made = _ready(model, _with_first_values(model, made, rows, come), rows)
     alone = made.take(rows)
     for effect in model.effects:
-        effect.check(alone)
+        effect.check_arrivals(made, rows)
     ids, length = alone.own_colony_id, alone.length.detach()
     note = Arrived(ids, alone.uid, length, step=state.step, time=state.time)
     return made.replace(arrived=(*state.arrived, note))

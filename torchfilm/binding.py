@@ -127,8 +127,10 @@ def taken_over(scene: Scene, state: State) -> State:
     # names that rules are the first to set
     model.trace(model.opened(made, 0.0) if made.cells else None)
     own = lambda e: {f.name for f in e.declares()}
-    # cells may be beyond a medium that others have grown without
-    strange = [e for e in model.effects if e in media or not new.isdisjoint(own(e))]
+    # cells may be beyond a medium, or the faces of a space, that others have grown without
+    placed = [e for e in model.effects if state.space != model.space and e.effect.periodic_space]
+    placed += media
+    strange = [e for e in model.effects if e in placed or not new.isdisjoint(own(e))]
     for effect in model.effects:
         follows = isinstance(effect, BoundRules | BoundCircuit) or effect.moves_signals
         if effect in strange or follows:

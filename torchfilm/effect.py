@@ -33,6 +33,8 @@ from torchfilm.tools.timing import Timings
 from torchfilm.values import CELL, ByType, Rule, checked, is_drawn
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from torchfilm.physics.space import PeriodicSpace
     from torchfilm.tools.hot_reload import HotReload
 
@@ -195,8 +197,7 @@ class Effect(metaclass=checks.KnownKeywords):
         """Raise InputError if this effect cannot start from this first state."""
 
     def check_step(self, dt: float, divides: bool) -> None:
-        """Raise InputError for a step of dt hours that this effect cannot follow. divides: cells
-        may."""
+        """Raise InputError for a step of dt h that it cannot follow. divides: cells may."""
 
     def step(self, state: State, dt: float, values: Values) -> State:
         """The state after this effect has acted for dt hours."""
@@ -303,11 +304,9 @@ class BoundEffect:
         return found
 
     def declares(self) -> list[Field]:
-        """The effect's fields with their first values bound, and one field for each value that is
-        drawn at birth."""
-        return [
-            self._bound(f) for f in self.effect.declares(self.binding.dim)
-        ] + self._value_fields()
+        """Its fields with their first values bound, and one for each value drawn at birth."""
+        own = map(self._bound, self.effect.declares(self.binding.dim))
+        return [*own, *self._value_fields()]
 
     def _value_fields(self) -> list[Field]:
         kept = self.effect.kept_values()
@@ -327,11 +326,9 @@ class BoundEffect:
 
     def reads(self) -> tuple[str, ...]:
         """Names of what a step reads; the fields of its own drawn values are among them."""
-        drawn = [
-            v.field for v in self.values.__dict__.values() if v is not None and v.field is not None
-        ]
-        typed = [v for v in self.values.__dict__.values() if v is not None and v.types is not None]
-        types = ("cell_type",) if typed else ()
+        each = [v for v in vars(self.values).values() if v is not None]
+        drawn = [v.field for v in each if v.field is not None]
+        types = ("cell_type",) if any(v.types is not None for v in each) else ()
         return tuple(dict.fromkeys((*self.effect.reads(), *self.effect.needs(), *drawn, *types)))
 
     def writes(self) -> tuple[str, ...]:
@@ -358,6 +355,10 @@ class BoundEffect:
         """Raise InputError if this effect cannot start from this first state."""
         self.effect.check(state, self.values)
 
+    def check_arrivals(self, state: State, rows: Tensor) -> None:
+        """Raise InputError if it cannot go on with the cells `rows` (M,) that come to others."""
+        self.check(state.take(rows))
+
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         """Raise InputError if this effect cannot act together with the others (all traced)."""
 
@@ -373,8 +374,7 @@ class BoundEffect:
         return {v.name: v.known_types for v in each if v.known_types}
 
     def check_step(self, dt: float, divides: bool) -> None:
-        """Raise InputError for a step of dt hours that this effect cannot follow. divides: cells
-        may."""
+        """Raise InputError for a step of dt h that it cannot follow. divides: cells may."""
         self.effect.check_step(dt, divides)
 
     def step(self, state: State, dt: float) -> State:

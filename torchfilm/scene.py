@@ -203,7 +203,7 @@ class Scene(metaclass=checks.KnownKeywords):
         have first values; it gets this scene's medium where it has none. All else stays, also
         fields that only the other scene has. Raises InputError where the two do not fit, as with
         another dimension, other signals or another grid, and where a cell may not be where it
-        is."""
+        is; warns where one lies behind a hard wall."""
         return taken_over(self, state)
 
     @property

@@ -276,6 +276,43 @@ def test_sloughing_needs_a_wall_and_first_cells_that_it_holds():
         film(tf.Sloughing(), cells=high).bind()
 
 
+def test_cells_that_come_may_be_held_by_those_that_are_there():
+    model = film(tf.Sloughing(), cells=layers(1)).bind()
+    state = model.add(model.start(), tf.Cells([[2.0, 1.5]], [[1.0, 0.0]], 2.0))
+    assert model.step(state).cells == layers(1).count + 1
+    with pytest.raises(InputError, match=r"take cell 5 of colony 0 .*no chain of cells less"):
+        model.add(model.start(), tf.Cells([[2.0, 2.5]], [[1.0, 0.0]], 2.0))
+
+
+@pytest.mark.parametrize("effect", [tf.Erosion([0.0, 0.15]), tf.Sloughing()])
+def test_what_stays_keeps_its_gradient(effect):
+    """Cells that leave take their share along. A colony that loses none has the gradient that it
+    has alone."""
+
+    def left(make: torch.Tensor) -> tuple[tf.State, torch.Tensor]:
+        scene = film(
+            tf.Circuit(lambda u, s, p, cell: {"g": p.make - 0.5 * u.g}, species="g", make=make),
+            effect, dt=0.05,
+        )  # fmt: skip
+        model = scene.bind(2, dtype=torch.float64, seed=1)
+        state = model.start()
+        for k in range(20):
+            if k == 10 and isinstance(effect, tf.Sloughing):  # the upper layers lose their hold
+                state = state.remove(
+                    (state.colony == 1) & ((state.position[:, 1] - 1.5).abs() < 0.1)
+                )
+            state = model.step(state)
+        return state, torch.stack([state.g[state.colony == k].sum() for k in range(2)])
+
+    make = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+    state, total = left(make)
+    assert state.counts[0] == 25 and 0 < state.counts[1] < 20
+    for k in range(2):
+        (slope,) = torch.autograd.grad(total[k], make, retain_graph=True)
+        # g is in proportion to what makes it
+        assert float(slope) == pytest.approx(float(total[k].detach()) / 2.0, rel=1e-6)
+
+
 def test_a_state_on_a_gpu_erodes_by_the_bits_of_the_cpu(pretended_cuda):  # noqa: F811
     losing = (tf.Erosion([0.05, 0.2]), tf.Sloughing(), tf.Lysis(rate=0.2))
     scene = film(tf.Growth(rate=0.5), tf.Division(length=4.0), *losing)

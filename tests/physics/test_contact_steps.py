@@ -11,9 +11,7 @@ from helpers import array, crowd, growth, mechanics, pair_gaps, seeded, step
 from scipy.integrate import solve_ivp
 
 import torchfilm as tf
-from torchfilm.kernels.compiling import for_python
 from torchfilm.kernels.scheme import SHRINK
-from torchfilm.kernels.step import HARD, _following
 from torchfilm.physics.problem import CONVERGED, NOT_FINITE
 
 CONTACTS = pytest.mark.parametrize("contacts", ["bilateral", "one-sided"])
@@ -205,32 +203,6 @@ def test_gradient_through_the_solve(contacts):
                 assert float(found.view(-1)[k]) == pytest.approx(
                     (ends[0] - ends[1]) / 2e-5, abs=1e-7
                 ), (name, k)
-
-
-@pytest.mark.parametrize("worst, peaks", [(0.05, False), (0.1, False), (0.2, True), (1.0, True)])
-def test_alpha_follows_the_mean_overlap_and_the_few_that_are_far_above_it(worst, peaks):
-    """400 contacts, all but one with the overlap that is wanted: α stays as it is, or becomes so
-    hard that the eighth root of the mean eighth power is what it may be at most."""
-    target, most, hardness = 0.007, 0.05, 1e-4
-    e = -np.full(400, target)
-    e[7] = -worst
-    limits = 1.0, 1e-9, most
-    rows = None, None, None, np.zeros(400, np.int64), np.full(400, HARD)
-    found = for_python(_following)(e, rows, hardness, target, limits)
-    by_mean = hardness * target / np.mean(-e)
-    by_peaks = hardness * most / np.mean(e**8) ** 0.125
-    assert (by_peaks < by_mean) == peaks
-    assert found == pytest.approx(min(by_mean, by_peaks, 2 * hardness), rel=1e-12)
-
-
-@pytest.mark.parametrize("at_walls, by", [(0.001, 0.012), (0.012, 0.012), (0.024, 0.021)])
-def test_alpha_follows_contacts_between_cells_where_those_with_walls_are_lighter(at_walls, by):
-    """300 contacts with walls, 100 between cells: by the larger mean, of all or of the latter."""
-    e = np.where(np.arange(400) < 100, -0.012, -at_walls)
-    wall = np.where(np.arange(400) < 100, 5, -1)  # the second cell, or which wall
-    rows = None, None, None, wall, np.full(400, HARD)
-    found = for_python(_following)(e, rows, 1e-4, 0.007, (1.0, 1e-9, 1.0))
-    assert found == pytest.approx(1e-4 * 0.007 / by, rel=1e-12)
 
 
 @CONTACTS

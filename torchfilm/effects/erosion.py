@@ -92,7 +92,6 @@ class Erosion(Effect):
     def _ground(self, state: State) -> Floor:
         return Floor.of("Erosion", state, self.spacing, self.floor, self.across, of_medium=False)
 
-    @torch.no_grad()
     def step(self, state: State, dt: float, values: Values) -> State:
         gone = torch.zeros(state.cells, dtype=torch.bool, device=state.device)
         rate = values.rate.of_colonies(state)
@@ -104,6 +103,7 @@ class Erosion(Effect):
         state = state.replace(reports={**state.reports, self.title: report})
         return state.remove(gone, "eroded")
 
+    @torch.no_grad()
     def _eroded(self, state: State, rate: Tensor, dt: float) -> Tensor:
         """Which cells leave within dt hours, (N,) bool.
 

@@ -69,9 +69,14 @@ class BoundSloughing(BoundEffect):
             )
 
     def check(self, state: State) -> None:
-        super().check(state)
+        self.check_arrivals(state, torch.arange(state.cells, device=state.device))
+
+    def check_arrivals(self, state: State, rows: Tensor) -> None:
+        """Other cells may hold them."""
+        loose = torch.zeros(state.cells, dtype=torch.bool, device=state.device)
+        loose[rows] = self._loose(state)[rows]
         check_none_taken(
-            "Sloughing", state, self._loose(state),
+            "Sloughing", state, loose,
             f"from where no chain of cells less than {self.effect.gap:g} µm apart leads to a wall."
             " Move the cell, or raise the gap.",
         )  # fmt: skip

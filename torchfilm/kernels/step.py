@@ -36,11 +36,20 @@ from torchfilm.kernels.compiling import lean
 from torchfilm.kernels.contact_pieces import shared_pair_rows, shares
 from torchfilm.kernels.contacts import most_rows, pair_rows
 from torchfilm.kernels.found import deep_cells, found_after, found_contacts
+from torchfilm.kernels.hardness import (
+    DEEP,
+    LIMIT,
+    PERIODS,
+    SOFT,
+    TOLERANCE,
+    following,
+    most_force,
+    of_colony,
+)
 from torchfilm.kernels.memory import TOP, copied, give_back, room, zeros
 from torchfilm.kernels.moves import drags, still_moving
 from torchfilm.kernels.neighbours import spatial_order
 from torchfilm.kernels.rows import (
-    HARD,
     STIFF,
     deeply_overlapping,
     degrees,
@@ -50,35 +59,24 @@ from torchfilm.kernels.rows import (
 )
 from torchfilm.kernels.scheme import (
     DEEP_AFTER_MANY,
-    HARDEST,
     HOPS,
     ITERATION_LIMIT,
     LAG,
     LONG_MOVES,
     MANY_SUBSTEPS,
-    MARGIN,
     MOST_HOPS,
     MOST_SOFTER,
     NOT_FINITE,
-    OVERLAP,
-    PEAK,
-    PEAKED,
     SHORTER,
     SHRINK,
     SLOWER,
     SLOWEST,
     SOFTER,
-    SOFTEST,
-    UNMOVED,
 )
 from torchfilm.kernels.solve import minimise
 from torchfilm.kernels.solve_parts import overlaps
 from torchfilm.kernels.team import next_of
 from torchfilm.kernels.wall_moves import move_cells
-
-# Places in the settings. DEEP: µm, or if below 0 in radii. YIELD: mean overlap, radii. PERIODS:
-# the first of three, see `kernels.images`.
-DEEP, TOLERANCE, MOST_PASSES, LIMIT, SOFT, YIELD, PERIODS = range(7)
 
 
 @lean
@@ -208,9 +206,10 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
     hardness: (1,) α. walls: kinds, places, sizes, which are soft, and (S, n) their D, or
     stiffness · Δt. alphas: (n,), or (0,). bonds and their reaches, µm: see `kernels.bonds`.
     """
-    margin, target, deep, limits, passes = _of_colony(length, growth, radius, drag, settings)
+    margin, target, deep, limits, passes = of_colony(
+        length, growth, radius, drag, hardness, settings
+    )
     tolerance, given, near = settings[TOLERANCE], alphas.shape[0] > 0, margin + reach[0]
-    hardness[0] = hardness[0] if hardness[0] > 0 else limits[0]
     arrays = _arrays(memory, length, growth, shortest, last, walls[4])
     periods, half, y, kept = settings[PERIODS:], arrays[2], arrays[6], arrays[7]
     number, deeply, softer, rising, held, kept_alpha = 0, False, 1.0, True, 0.0, 0.0
@@ -248,7 +247,8 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
             break
         if error <= tolerance and number == 0 and not given:
             report[ALPHA] = before = kept_alpha if failed else hardness[0]  # of this solve
-            hardness[0] = before if failed else _following(e, rows, before, target, limits)
+            most = most_force(x, y, arrays[5], radius, growth, drag, reach, walls[3], dof)
+            hardness[0] = before if failed else following(e, rows, before, target, limits, most)
             if hardness[0] < LAG * before and not failed:  # the force has grown: solve again
                 put(y, kept)
                 held, kept_alpha, rising = error, before, False
@@ -323,52 +323,6 @@ def _noted(report, error, tolerance):
     elif error > tolerance:
         report[STATUS] = max(report[STATUS], ITERATION_LIMIT)
     return error < np.inf
-
-
-@lean
-def _of_colony(base, growth, radius, drag, settings):
-    """The margin, the overlap that is wanted, how deep is too deep, all µm, the α of the softest
-    and of the hardest contacts with the most overlap that peaks may have, and the most passes."""
-    viscosity, length_drag = drag
-    wide, across, held, n = 0.0, 0.0, 0.0, base.shape[0]
-    for i in range(n):
-        wide += radius[i] / n
-        across += viscosity[i] * (base[i] + growth[i] + 2 * radius[i]) / n
-        held += length_drag[i] * max(growth[i], 0.0) / n
-    deep = settings[DEEP] if settings[DEEP] > 0 else -settings[DEEP] * wide
-    softest = SOFTEST * settings[YIELD] / OVERLAP / across
-    target, hardest = settings[YIELD] * wide, HARDEST * softest
-    if held > 0:
-        hardest = min(hardest, UNMOVED * target / held)
-    passes = 1.0 if settings[SOFT] > 0 else settings[MOST_PASSES]
-    limits = softest, hardest, max(PEAK * deep, PEAKED * target)
-    return MARGIN * wide, target, deep, limits, passes
-
-
-@lean
-def _following(e, rows, hardness, target, limits):
-    """α at which the mean overlap of the contacts that push, all of them and those between cells,
-    is at most `target`, µm, and that of the eighth powers the third of the limits: harder at once,
-    softer by a factor of two a step. Rows at the ends of stretches do not count."""
-    total, count, peaks, between, pairs = 0.0, 0, 0.0, 0.0, 0
-    softest, hardest, most = limits
-    for r in range(e.shape[0]):
-        pushes = (e[r] < 0) & (rows[4][r] == HARD)
-        own = -e[r] if pushes else 0.0  # without branches: their outcome is not foreseen
-        total += own
-        between += own if rows[3][r] >= 0 else 0.0
-        pairs += pushes & (rows[3][r] >= 0)
-        part = (own / most) ** 2
-        part *= part
-        peaks += part * part
-        count += pushes
-    wanted = softest
-    if count:
-        force = max(total / count, between / max(pairs, 1)) / hardness
-        peak = math.sqrt(math.sqrt(math.sqrt(max(peaks / count, 1e-300))))
-        if force > 0:
-            wanted = min(wanted, target / force, hardness / peak)
-    return max(min(wanted, 2.0 * hardness), hardest)
 
 
 @lean

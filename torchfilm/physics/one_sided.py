@@ -9,7 +9,6 @@ from torch import Tensor
 
 from torchfilm.kernels.scheme import (
     DEEP_AFTER_MANY,
-    HARDEST,
     HOPS,
     LAG,
     LONG_MOVES,
@@ -18,21 +17,17 @@ from torchfilm.kernels.scheme import (
     MAX_TURN,
     MOST_HOPS,
     MOST_SOFTER,
-    OVERLAP,
-    PEAK,
-    PEAKED,
     SHORTER,
     SHRINK,
     SLOWER,
     SLOWEST,
     SOFTER,
-    SOFTEST,
-    UNMOVED,
 )
 from torchfilm.physics import capsule, compiled_solve
 from torchfilm.physics.adhesion import roots_of, wall_roots_of, with_bonds, with_wall_bonds
 from torchfilm.physics.adjoint import attach_gradient
 from torchfilm.physics.contacts import CandidateContacts, Capsules
+from torchfilm.physics.hardness import Following, Limits
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.near_rows import near_rows
 from torchfilm.physics.one_sided_solve import Minimum, Solved, minimise
@@ -49,7 +44,7 @@ from torchfilm.physics.wall_contacts import (
 )
 from torchfilm.tools.ragged import marked
 from torchfilm.tools.reads import numbers, rows_where
-from torchfilm.tools.vectors import nearest_root, nearest_to, safe_norm
+from torchfilm.tools.vectors import nearest_to, safe_norm
 
 
 def contact_steps(given: StepInput) -> StepResult:
@@ -97,20 +92,7 @@ class _OneStep:
     ):
         self.given, self.groups, self.dim = given, given.groups, given.settings.dim
         self.growth, self.active = growth, active
-        count = self.groups.counts.clamp(min=1)
-        mean = lambda x: self.groups.sum(x.double()) / count
-        self.wide = mean(given.radius)
-        yielding = given.settings.contact_overlap
-        self.target = yielding * self.wide
-        whole = length + growth + 2 * given.radius
-        self.softest = SOFTEST * yielding / OVERLAP / mean(given.viscosity * whole)
-        held = mean(given.length_drag * growth.clamp(min=0.0))
-        some = held > 0  # a division by 0 would spoil gradients
-        least = torch.where(some, UNMOVED * self.target / torch.where(some, held, 1.0), torch.inf)
-        self.hardest = torch.minimum(HARDEST * self.softest, least)
-        with torch.no_grad():
-            own = given.settings.overlap
-            self.deep = deep * self.wide if own is None else torch.full_like(self.wide, own)
+        self.limits = Limits(given, length + growth, growth, deep)
         self.of_cells = lambda x: self.groups.spread(x).to(given.radius.dtype)
 
     def taken(self, at: StepResult) -> StepResult:
@@ -123,7 +105,7 @@ class _OneStep:
         rows, base = cells, at.length
         least = torch.maximum(base - SHRINK * self.growth.clamp(min=0.0), given.shortest)
         at = replace(at, length=torch.where(moving, base + self.growth, base))
-        hardness = torch.where(at.hardness > 0, at.hardness, self.softest)
+        hardness = torch.where(at.hardness > 0, at.hardness, self.limits.softest)
         at = replace(at, hardness=hardness, alpha=torch.where(active, 0.0, at.alpha))
         for number in range(1 if given.settings.soft else int(given.settings.passes)):
             pairs, walls = self._contacts(at, rows, number == 0)
@@ -154,7 +136,7 @@ class _OneStep:
         start = given.position.detach().index_select(0, first)  # only for the size of numbers
         local, axis = at.position - start.index_select(0, owner), at.axis.double()
         length, radius = at.length.double(), given.radius.double()
-        margin = MARGIN * self.wide.index_select(0, owner)
+        margin = MARGIN * self.limits.wide.index_select(0, owner)
         apart = at_walls = margin
         if given.bonds is not None:
             held = given.bonds.apart(given.drift, self.groups)
@@ -193,13 +175,13 @@ class _OneStep:
         count, owner = self.given.radius.numel(), self.groups.owner
         one = torch.cat([pairs.first, pairs.second])
         other = torch.cat([pairs.second, pairs.first])
-        gap, deep = gap.repeat(2), self.deep.index_select(0, owner.index_select(0, one))
+        gap, deep = gap.repeat(2), self.limits.deep.index_select(0, owner.index_select(0, one))
         mark, near = marked(count, one, gap < -deep), gap < 0.1 * deep
         for _ in range(hops):
             mark = mark | marked(count, one, near & mark.index_select(0, other))
         root, soft = self._wall_roots(walls, torch.ones_like(self.given.radius))
         hard = ~soft & (root >= 1)  # a lighter wall is meant to give way
-        limit = self.deep.index_select(0, owner.index_select(0, walls.cell))
+        limit = self.limits.deep.index_select(0, owner.index_select(0, walls.cell))
         return mark | marked(count, walls.cell, hard & (walls.gap.detach() < -limit))
 
     def _wall_roots(self, walls: WallContacts, alpha: Tensor) -> tuple[Tensor, Tensor]:
@@ -224,7 +206,7 @@ class _OneStep:
         their moves."""
         given, settings, first_pass = self.given, self.given.settings, number == 0
         owner = self.groups.owner.index_select(0, pairs.first)
-        margin = MARGIN * self.wide.index_select(0, owner)
+        margin = MARGIN * self.limits.wide.index_select(0, owner)
         contacts = near_rows(pairs, None if settings.soft else margin)
         if given.bonds is not None:
             half, begin = 0.5 * at.length.double(), given.bonds.begin.half
@@ -232,16 +214,18 @@ class _OneStep:
             now = Capsules(at.position.T, at.axis.double().T, half, given.radius)
             contacts = with_bonds(contacts, given.bonds, now)
             walls = with_wall_bonds(walls, given.bonds, now)
-        solved = self._solved(at, contacts, walls, moving, cells, active, least, number)
+        follows = first_pass and given.alpha is None
+        following = self._following(at, contacts, walls, cells) if follows else None
+        solved = self._solved(at, contacts, walls, moving, cells, active, least, number, following)
         part, end = solved.problem, solved.end
         y = self._with_gradient(part, end)
         move = torch.zeros_like(at.move).index_copy(0, cells, y * part.scale)
         sound = (end.error < torch.inf) & active
         status = torch.where(end.error <= settings.tolerance, CONVERGED, ITERATION_LIMIT)
         status = torch.where(end.error < torch.inf, status, NOT_FINITE)
-        if first_pass and given.alpha is None:
+        if following is not None:
             after = part.gap_after(y) if y.requires_grad else end.after
-            followed = self._followed(solved.hardness, part, after, contacts, walls)
+            followed = following.alpha(solved.hardness, part, y, after)
             followed = torch.where(solved.fell, solved.hardness, followed)
             good = sound & (end.error <= settings.tolerance)
             some = good & (self.groups.counts > 0)
@@ -262,12 +246,21 @@ class _OneStep:
         moving = moving & self.of_cells(sound).bool()
         return self._moved(at, move, about, moving, least, number)
 
-    def _solved(self, at, contacts, walls, moving, cells, active, least, number) -> Solved:
+    def _following(self, at, contacts, walls, cells) -> Following:
+        """What α follows in a first pass, which moves all cells."""
+        root, soft = self._wall_roots(walls, torch.ones_like(self.given.radius))
+        hard = torch.cat([~contacts.beside, ~soft & (root >= 1)])
+        place, wide = at.position.double(), 2.0 * self.given.radius.double()
+        of = lambda x: x.index_select(0, cells)
+        return Following(self.limits, hard, len(contacts.gap), of(place), of(wide))
+
+    def _solved(
+        self, at, contacts, walls, moving, cells, active, least, number, following
+    ) -> Solved:
         """Solve for the moving cells: with softer contacts where a solve does not converge, then
         harder again; and in a first pass again where the force has grown much."""
         given, settings, first_pass = self.given, self.given.settings, number == 0
         hardness, softer = at.hardness, torch.ones_like(at.hardness)
-        follows = first_pass and given.alpha is None
         spent, fell = torch.zeros_like(at.iterations), torch.zeros_like(active)
         again, rising, kept_alpha, goes_on = active, torch.ones_like(active), hardness, 1
         end: Minimum | None = None
@@ -287,7 +280,7 @@ class _OneStep:
                 start = torch.where(going_on, end.y, start)
             with torch.no_grad():
                 solve = compiled_solve.minimise if settings.compiled else minimise
-                limits = settings.tolerance, 2 * self.target, settings.max_iterations
+                limits = settings.tolerance, 2 * self.limits.target, settings.max_iterations
                 found = solve(part.detached(), start, *limits)
                 end = found if end is None else found.where(again, end, part)
                 spent = spent + torch.where(again, end.iterations, 0)
@@ -296,9 +289,11 @@ class _OneStep:
                 down = again & ~failed & (softer > 1)
                 falls = failed & ~rising & (given.alpha is None)
                 fell = fell | falls
-                lags = again & ~failed & ~down & (end.error < torch.inf) & follows
-                if follows:
-                    wanted = self._followed(hardness, part, end.after, contacts, walls)
+                lags = again & ~failed & ~down & (end.error < torch.inf)
+                if following is None:
+                    lags = torch.zeros_like(lags)
+                else:
+                    wanted = following.alpha(hardness, part, end.y, end.after)
                     lags = lags & (wanted < LAG * hardness)
                 end = end if kept is None else kept.where(falls, end, part)
                 kept = end if kept is None else end.where(down | lags, kept, part)
@@ -308,10 +303,10 @@ class _OneStep:
             goes_on, some_lag, falls_back = numbers(again.any(), lags.any(), falls.any())
             if not (goes_on or falls_back):
                 return Solved(part, end, used, spent, fell)
-            if follows and some_lag:
+            if following is not None and some_lag:
                 y = self._with_gradient(part, end)
                 after = part.gap_after(y) if y.requires_grad else end.after
-                wanted = self._followed(hardness, part, after, contacts, walls)
+                wanted = following.alpha(hardness, part, y, after)
                 hardness = torch.where(lags, wanted, hardness)
             hardness = torch.where(falls, was, hardness)
             factor = torch.where(up, SOFTER, torch.where(down, 1.0 / SOFTER, 1.0))
@@ -341,7 +336,7 @@ class _OneStep:
         turns = settings.degrees - settings.dim - 1
         length_drag = torch.where(rigid, torch.inf, given.length_drag)
         if number > LONG_MOVES:
-            most = (SLOWEST * self.softest / at.hardness).clamp(min=1.0)
+            most = (SLOWEST * self.limits.softest / at.hardness).clamp(min=1.0)
             slower = self.of_cells(most.clamp(max=SLOWER ** (number - LONG_MOVES)))
             across, turning = slower * across, slower * turning
         drag = [across] * settings.dim + [turning] * turns + [length_drag]
@@ -367,37 +362,12 @@ class _OneStep:
         alphas = alpha.unsqueeze(1).expand_as(scale).to(dtype).contiguous()
         return ContactProblem(rows, gap, applied, alphas, low, scale, rigid, self.groups)
 
-    def _followed(self, hardness: Tensor, problem, after: Tensor, contacts, walls) -> Tensor:
-        """α of each colony at which the mean overlap of contacts, all and those between cells, is
-        at most the target: see `kernels.step._following`. `after`: each row's gap."""
-        root, soft = self._wall_roots(walls, torch.ones_like(self.given.radius))
-        hard = torch.cat([~contacts.beside, ~soft & (root >= 1)])  # all: the first pass moves all
-        overlap = torch.where(hard, -after, 0.0).clamp(min=0.0).double()
-        most = torch.maximum(PEAK * self.deep, PEAKED * self.target)
-        powers = overlap / most.index_select(0, problem.of_rows.owner)
-        for _ in range(3):
-            powers = powers * powers
-        of_pairs = torch.cat([overlap[: len(contacts.gap)], torch.zeros_like(walls.gap)])
-        some = ((x > 0).double() for x in (overlap, of_pairs))
-        each = torch.stack([overlap, of_pairs, *some, powers], 1)
-        total, between, count, pairs, peaks = problem.of_rows.sum(each).unbind(1)
-        count, pairs = count.clamp(min=1), pairs.clamp(min=1)
-        force = torch.maximum(total / count, between / pairs) / hardness
-        pushes = force > 0
-        wanted = self.target / torch.where(pushes, force, 1.0)
-        peak = torch.where(pushes, peaks / count, 1.0).clamp(min=1e-300)
-        for _ in range(3):
-            peak = nearest_root(peak)
-        wanted = torch.minimum(wanted, hardness / peak)
-        wanted = torch.where(pushes, torch.minimum(wanted, self.softest), self.softest)
-        return torch.maximum(torch.minimum(wanted, 2 * hardness), self.hardest)
-
     def _moved(self, at, move, about, moving, least, number: int) -> StepResult:
         """Carry out the moves (N, D) of the moving cells: the translation at most MARGIN radii from
         `about` (N, d), or less after many passes, the rotation as far at the ends; and a cell comes
         no deeper than its radius behind a hard wall."""
         shorter = SHORTER if number > LONG_MOVES else 1.0
-        dim, bound = self.dim, self.of_cells(shorter * MARGIN * self.wide)
+        dim, bound = self.dim, self.of_cells(shorter * MARGIN * self.limits.wide)
         beyond = move[:, :dim] - about
         way, angle = safe_norm(beyond.T), safe_norm(move[:, dim:-1].T)
         most = (2.0 * bound / at.length.clamp(min=1e-9)).clamp(max=MAX_TURN)
