@@ -98,15 +98,6 @@ def test_colonies_are_named_by_what_their_parameter_was_then(tmp_path, medium):
         assert [last.name(k) for k in (0, 1)] == ["rate = 3e-09", "rate = 4e-09"]
 
 
-def test_replicates_whose_kinds_are_counted_apart_have_their_ids(tmp_path):
-    founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], cell_type=[0])
-    scene = tf.Scene(tf.Lysis(rate=[1e-9, 1e-9, 2e-9]), founders=founders, dim=2, dt=0.1)
-    start = scene.bind().start().select([2, 1, 0])
-    tf.simulate(scene, start, until=0.2, record=tmp_path / "run.h5").last()
-    lines = pictures.time_course(tmp_path / "run.h5", by="cell_type").figure
-    assert [text.split(", ")[1] for text in legend(lines)] == ["colony 2", "colony 1", "colony 0"]
-
-
 def test_parameters_that_hardly_differ_have_names_of_their_own(tmp_path):
     """Colonies of one name are replicates, whose mean a time course draws."""
     scene = tf.Scene(tf.Growth(rate=[0.50001, 0.50002, 2.0]), dim=2, dt=0.1)

@@ -54,7 +54,8 @@ def test_it_shows_the_counts_and_the_means_of_the_cells(run, tmp_path):
                 at = band[np.isclose(band[:, 0], results.times[f])][:, 1]
                 assert at.min() == pytest.approx(low) and at.max() == pytest.approx(high)
     assert gfp.get_ylabel() == "mean of gfp (conc)" and outside.get_xlabel() == "time (h)"
-    assert [t.get_text() for t in counts.get_legend().get_texts()] == ["colony 0", "colony 3"]
+    shown = [t.get_text() for t in counts.get_legend().get_texts()]
+    assert shown == ["make = 1, rate = 0", "make = 1.75, rate = 0"]
 
 
 def test_colonies_that_die_leave_the_picture_and_many_have_no_bands(run):
@@ -160,16 +161,127 @@ def test_replicates_are_thin_lines_of_one_colour_beside_their_mean(tmp_path):
                      colony=[0, 1, 2], extra=first)  # fmt: skip
     tf.simulate(tf.Scene(circuit, dim=2, founders=start, dt=0.1), until=0.5, record=path).last()
     figure = tf.pictures.time_course(path, "gfp").figure
-    one, two, alone, mean = figure.axes[1].lines
+    one, two, mean, alone = figure.axes[1].lines
     assert one.get_color() == two.get_color() == mean.get_color() != alone.get_color()
     assert one.get_linewidth() == two.get_linewidth() < mean.get_linewidth()
     np.testing.assert_allclose(mean.get_ydata(), (one.get_ydata() + two.get_ydata()) / 2)
     assert abs(one.get_ydata() - two.get_ydata()).max() > 1.0
     shown = [text.get_text().replace("\u2009", " ") for text in figure.axes[0].get_legend().texts]
-    assert shown == ["make = 2", "make = 1, mean of 2"]
-    # by kind, they are told apart by their colonies
-    split = tf.pictures.time_course(path, "gfp", by="cell_type").figure.axes[0].get_legend().texts
-    assert [t.get_text().split(", ")[1] for t in split] == ["colony 0", "colony 1", "colony 2"]
+    assert shown == ["make = 1, mean of 2", "make = 2"]
+    # by kind, too: a colour for each, and a style for each condition
+    split = tf.pictures.time_course(path, "gfp", by="cell_type").figure.axes
+    shown = [text.get_text() for text in split[0].get_legend().texts]
+    assert shown == ["make = 1, cell_type 0, mean of 2", "make = 2, cell_type 0"]
+    drawn = split[1].lines
+    np.testing.assert_array_equal(drawn[2].get_ydata(), mean.get_ydata())
+    assert [line.get_linestyle() for line in drawn] == ["-", "-", "-", "--"]
+    assert len({line.get_color() for line in drawn}) == 1
+    # unless they are told apart
+    named = {k: f"colony {k}" for k in range(3)}
+    split = tf.pictures.time_course(path, by="cell_type", conditions=named).figure.axes[0].legend_
+    assert [t.get_text() for t in split.texts] == [f"colony {k}, cell_type 0" for k in range(3)]
+
+
+def dies(cells):
+    """Cells of type 1 die at 0.3 h, those of type 2 have no gfp that is a number then."""
+    late = cells.time > 0.25
+    cells.remove_flag = late & (cells.cell_type == 1)
+    cells.gfp = np.where(late & (cells.cell_type == 2), np.nan, cells.gfp)
+
+
+@pytest.fixture(scope="module")
+def replicated(tmp_path_factory):
+    """Twelve colonies: of two doses and two rates in turn; one dies out, and one fails."""
+    path = tmp_path_factory.mktemp("replicated") / "run.h5"
+    kinds = [1, 0, 2] + [0] * 9
+    founders = tf.Cells([[0.0, 0.0]] * 12, [1.0, 0.0], [2.0 + 0.1 * k for k in range(12)],
+                        cell_type=kinds, colony=list(range(12)))  # fmt: skip
+    circuit = tf.Circuit(
+        lambda u, s, p, cell: {"gfp": p.iptg - u.gfp}, species="gfp", iptg=[0.1, 2.0] * 6
+    )
+    scene = tf.Scene(
+        tf.Growth(rate=(1.0 + 0.05 * np.arange(12)).round(2)), tf.Division(length=4.0), circuit,
+        tf.Rules(dies), founders=founders, dt=0.05,
+    )  # fmt: skip
+    record = tf.Recorder(path, scene, every=1)
+    tf.simulate(scene, until=1.0, record=record, on_failure="drop").last()
+    return path
+
+
+def test_means_of_numbers_count_those_that_died_and_not_those_that_failed(replicated):
+    figure = tf.pictures.time_course(replicated, "biovolume", "gfp", conditions="iptg").figure
+    with tf.Results(replicated) as results:
+        counts, times = results.counts, results.times
+        volume = results.table(-1)
+    first = [k for k in range(12) if k % 2 == 0]
+    assert counts[-1, 0] == counts[-1, 2] == 0 < counts[-1, 4:].min()
+    ax, biovolume, gfp = figure.axes
+    assert [t.get_text() for t in ax.get_legend().texts] == [
+        "iptg = 0.1, mean of 6", "iptg = 2, mean of 6",
+    ]  # fmt: skip
+    mean = ax.lines[6].get_ydata()
+    live = counts[:, first].astype(float)
+    live[:, 1][counts[:, 2] == 0] = np.nan  # the failed one
+    np.testing.assert_allclose(mean, np.nanmean(live, 1))
+    own = [volume["volume"][volume["colony"] == k].sum() for k in first if k != 2]
+    assert biovolume.lines[6].get_ydata()[-1] == pytest.approx(sum(own) / 5, rel=1e-5)
+    assert biovolume.get_ylabel() == "biovolume (µm³)"
+    some = [volume["gfp"][volume["colony"] == k].mean() for k in (4, 6, 8, 10)]
+    assert gfp.lines[6].get_ydata()[-1] == pytest.approx(np.mean(some), rel=1e-5)
+    # a cross where one failed, a triangle where one died
+    marks = {tuple(c.get_offsets()[0].round(3)): len(c.get_paths()[0].vertices)
+             for c in ax.collections if len(c.get_offsets()) == 1
+             and not hasattr(c, "get_segments")}  # fmt: skip
+    died, failed = (
+        round(float(times[(counts[:, k] == 0).argmax() - e]), 3) for k, e in ((0, 0), (2, 1))
+    )
+    assert set(marks) == {(died, 0.0), (failed, 1.0)}
+
+
+def test_many_replicates_are_a_band(replicated):
+    every = {k: "all" for k in range(12)}
+    ax, length = tf.pictures.time_course(replicated, "length", conditions=every).figure.axes
+    assert len(ax.lines) == len(ax.collections) == len(length.lines) == 1
+    with tf.Results(replicated) as results:
+        counts = np.delete(results.counts, 2, 1)  # the failed one
+    np.testing.assert_allclose(ax.lines[0].get_ydata()[-1], counts[-1].mean())
+    band = ax.collections[0].get_paths()[0].vertices
+    end = band[np.isclose(band[:, 0], 1.0)][:, 1]
+    assert (end.min(), end.max()) == pytest.approx(tuple(np.percentile(counts[-1], [10, 90])))
+
+
+def test_conditions_are_of_parameters_or_named(replicated):
+    def shown(**options) -> list[str]:
+        (ax,) = tf.pictures.time_course(replicated, **options).figure.axes
+        return [text.get_text() for text in ax.legend_.texts]
+
+    assert shown(conditions=("iptg", "rate"), colonies=[1, 4]) == [
+        "iptg = 2, rate = 1.05", "iptg = 0.1, rate = 1.2",
+    ]  # fmt: skip
+    assert shown(conditions={7: "wet", 3: "dry", 5: "dry"}) == ["dry, mean of 2", "wet"]
+    two = tf.pictures.time_course(replicated, conditions="Growth.rate", most=2).figure
+    assert "first 2 of 12 colonies" in two.get_suptitle()
+    one = tf.pictures.time_course(replicated, conditions="iptg", most=1).figure
+    assert "first 1 of 2 conditions" in one.get_suptitle() and len(one.axes[0].lines) == 7
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"conditions": "itpg"}, r"conditions = 'itpg'.*one of iptg, .*Did you mean 'iptg'"),
+        ({"conditions": 3}, r"conditions = 3.*a parameter that has one value per colony"),
+        ({"conditions": {40: "wet"}}, r"conditions = 40.*ids of colonies: 0, 1"),
+        ({"conditions": {0: 1}}, r"conditions\[0\] = 1.*a name, as text"),
+        ({"conditions": {}}, "a name for at least one colony"),
+        ({"conditions": {3: "wet"}, "colonies": [4]}, "names of colonies that are drawn"),
+        ({"by": "iptg"}, r"by = 'iptg'.*For a parameter that differs .*conditions="),
+        ({"by": "rate"}, r"by = 'rate'"),
+        ({"by": "cell_type", "conditions": "rate", "colonies": range(6)}, "up to 4 conditions"),
+    ],
+)  # fmt: skip
+def test_bad_conditions(replicated, options, words):
+    with pytest.raises(tf.InputError, match=words):
+        tf.pictures.time_course(replicated, **options)
 
 
 def test_types_have_the_colours_of_pictures(tmp_path):

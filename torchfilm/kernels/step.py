@@ -206,9 +206,8 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
     hardness: (1,) α. walls: kinds, places, sizes, which are soft, and (S, n) their D, or
     stiffness · Δt. alphas: (n,), or (0,). bonds and their reaches, µm: see `kernels.bonds`.
     """
-    margin, target, deep, limits, passes = of_colony(
-        length, growth, radius, drag, hardness, settings
-    )
+    own = of_colony(length, growth, radius, drag, hardness, settings)
+    margin, target, deep, limits, passes = own
     tolerance, given, near = settings[TOLERANCE], alphas.shape[0] > 0, margin + reach[0]
     arrays = _arrays(memory, length, growth, shortest, last, walls[4])
     periods, half, y, kept = settings[PERIODS:], arrays[2], arrays[6], arrays[7]
@@ -230,8 +229,7 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
             continue
         error, e, m = _solved(
             memory, x, axis, radius, found, rows, at_walls, deep, margin, number, arrays, bonds,
-            reach, 2 * target, settings, report, team, dof,
-        )  # fmt: skip
+            reach, 2 * target, settings, report, team, dof)  # fmt: skip
         failed = error > tolerance and error < np.inf
         if failed and rising and softer < MOST_SOFTER:
             softer *= SOFTER

@@ -13,10 +13,10 @@ import numpy as np
 from torchfilm.io.identity import walls_of
 from torchfilm.io.layout import OBSTACLES
 from torchfilm.io.lineage import Lineage
-from torchfilm.io.parameters import column_names
 from torchfilm.io.results import Results
 from torchfilm.io.table import volumes
 from torchfilm.pictures.categories import colours_by_number
+from torchfilm.pictures.conditions import names_by_parameters
 from torchfilm.scene import Scene
 from torchfilm.state import CELL, PER_CELL, State
 from torchfilm.tools import checks
@@ -191,7 +191,7 @@ class RecordedFrames(Sequence[Frame]):
             walls=self.walls,
             faces=self.faces,
             internal=results.internal_fields,
-            names=_named(results.parameters(place)),
+            names=names_by_parameters(results.parameters(place)),
             if_asked=(VOLUME, *OF_FILES),
             type_names=results.type_names,
         ).asked(self.asked)
@@ -248,21 +248,6 @@ def _solid(kept: np.ndarray | None, shape: np.ndarray) -> Sequence[np.ndarray]:
     if kept is None or kept.shape != (shape.prod(1).sum(),):
         return ()
     return _parted(kept, shape)
-
-
-def _named(parameters: Mapping[str, np.ndarray]) -> list[str] | None:
-    """Colonies named by the one parameter that differs between them, such as "half = 0.1"; None
-    where no parameter differs, or several do."""
-    found = {path: x for path, x in parameters.items() if (x != x[:1]).any()}
-    if len(found) != 1:
-        return None
-    ((path, values),) = found.items()
-    name = column_names([path], set())[path]
-    for digits in range(4, 18):  # as many as it takes to tell them apart
-        words = [f"{value:.{digits}g}" for value in values.tolist()]
-        if len(set(words)) == len(np.unique(values)):
-            break
-    return [f"{name} = {word}" for word in words]
 
 
 def unit_of(name: str, units: Mapping[str, str]) -> str:

@@ -133,10 +133,12 @@ def _seen(
     return np.hypot(*(position - centre)[:, :2].T), value
 
 
-def known_quantities(results: Results, *wanted: str) -> Iterator[tuple[Columns, Columns]]:
+def known_quantities(
+    results: Results, *wanted: str, by: str | None = None
+) -> Iterator[tuple[Columns, Columns]]:
     """The cells of each frame, and what it tells of each cell, (N,) by name, signals at them under
-    "out.NAME"; volumes, ages and hours of birth where they are wanted. Raises InputError for a
-    wanted name that the file does not tell."""
+    "out.NAME"; volumes, ages and hours of birth where they are wanted. by: a field that they have,
+    too. Raises InputError for a wanted name that the file does not tell."""
     hidden, ids, tree = results.internal_fields, results.colony_id, None
     for block in blocks(results, range(len(results))):
         cells, signals = block.cells(), block.signals()
@@ -147,14 +149,14 @@ def known_quantities(results: Results, *wanted: str) -> Iterator[tuple[Columns, 
         if asked := [n for n in AGES if n in wanted and n not in known]:
             times = results.times[block.frames][block.which]
             known |= of_lineage(tree or (tree := results.lineage()), ids, cells, times, asked)
-        _check_known(known, signals, wanted)
+        _check_known(known, signals, wanted, by)
         ends = np.searchsorted(block.which, np.arange(len(block.frames) + 1))
         for first, end in itertools.pairwise(ends):
             rows = slice(first, end)
             yield {n: x[rows] for n, x in cells.items()}, {n: x[rows] for n, x in known.items()}
 
 
-def _check_known(known: Columns, signals: Columns, wanted: Sequence[str]) -> None:
+def _check_known(known: Columns, signals: Columns, wanted: Sequence[str], by: str | None) -> None:
     """Raise InputError for a wanted name that no cell has. signals: at the cells, by name."""
     names = [n for n in known if n not in ("uid", "parent", "colony")]
     names += [n for n in (VOLUME, *AGES) if n not in known]
@@ -167,6 +169,10 @@ def _check_known(known: Columns, signals: Columns, wanted: Sequence[str]) -> Non
             if quantity in signals:
                 hint = f"What is outside of cells is {OUTSIDE + quantity!r}."
             raise checks.input_error("quantity", quantity, f"one of {', '.join(names)}", hint)
+    if by is not None and by not in known:
+        hint = checks.suggestion(by, known)
+        hint = hint or "For a parameter that differs between colonies: conditions=…"
+        raise checks.input_error("by", by, f"one of {', '.join(known)}", hint)
 
 
 def _bins(places: np.ndarray, edges: Sequence[float] | None) -> np.ndarray:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,8 +13,9 @@ import numpy as np
 from torchfilm.io.results import Results
 from torchfilm.pictures.categories import KINDS, colours_of_kinds
 from torchfilm.pictures.colours import TYPES
+from torchfilm.pictures.conditions import condition_names
 from torchfilm.pictures.figures import check_not_results, choose_colonies, opened
-from torchfilm.pictures.frames import RecordedFrames
+from torchfilm.pictures.frames import VOLUME, RecordedFrames
 from torchfilm.pictures.page import checked_dpi
 from torchfilm.pictures.picture import Picture, new_figure
 from torchfilm.pictures.place_and_time import Columns, known_quantities, unit_at_cells
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WIDE, HIGH = 5.0, 2.2  # inches, of a panel
+BIOVOLUME = "biovolume"
+MANY = 10  # replicates, beyond which a band shows them
+TALL = 12  # names in a column of the legend
 FEW = 4  # colonies up to which a band shows the spread between cells
 BAND = (10.0, 90.0)  # percentiles
 TENFOLD = 10.0  # numbers of cells of such a range are drawn by their logarithms
@@ -36,60 +40,59 @@ def time_course(
     what: str | Path | Results,
     *quantities: str,
     by: str | None = None,
+    conditions: str | Sequence[str] | Mapping[int, str] | None = None,
     colonies: Sequence[int] | None = None,
     most: int = 8,
     log: bool = False,
     out: str | Path | None = None,
     dpi: float = 160,
 ) -> Picture:
-    """Draw the number of cells of each colony against time, and below it the mean of each quantity
-    over its cells; of up to four lines also the band from 10 to 90 % of the cells. Where
-    colonies differ in parameters, those of the same ones are thin lines of one colour, without a
-    band, beside the mean of those that have cells.
+    """Draw the number of cells of each colony against time, and below it each quantity: the mean
+    over its cells, of up to four lines also the band from 10 to 90 % of them. Colonies of one
+    condition are replicates: thin lines of one colour beside their mean, or if they are more than
+    ten, the band from 10 to 90 % of them. A mean of numbers of cells counts those that have died
+    out as 0; other means are of colonies that have cells.
 
     what: a results file, or its path. quantities: fields of the cells, "volume", "age" or "born",
-    or signals at them as "out.NAME". by: a field of whole numbers, such as "cell_type": cells of
-    each are counted apart, a colour for each, and a style of lines for each of up to four colonies.
-    colonies: their ids; default the first `most` that had cells. log: logarithmic axes of the
-    quantities; the number of cells has one where it grows more than tenfold. Where all cells of a
-    line have died, a triangle at 0 marks when; a logarithmic axis then has a 0 below 1. out: save
-    the picture there. Raises InputError for a quantity that is not recorded, and for a file of one
-    frame."""
+    signals at them as "out.NAME", or "biovolume", µm³, of all cells of a colony. by: a field of
+    whole numbers, such as "cell_type": cells of each are counted apart, a colour for each, and a
+    style of lines for each of up to four conditions. conditions: a parameter that has one value per
+    colony, as tables name it, or several: colonies in which these are the same are of one
+    condition; or names by id, {0: "control", 1: "control", 2: "starved"}. By default all
+    parameters count, where up to two differ. colonies: their ids; default those of the first `most`
+    conditions that had cells. log: logarithmic axes of the quantities; the number of cells has one
+    where it grows more than tenfold. Where all cells of a line have died, a triangle at 0 marks
+    when; a logarithmic axis then has a 0 below 1. A cross marks where a colony has failed. out:
+    save the picture there. Raises InputError for a quantity that is not recorded, and for a file of
+    one frame."""
     with opened(what) as results:
         check_not_results(results.path, out)
         checked_dpi(dpi)
         checks.choice("log", log, (True, False))
         if len(results) < 2:
             raise checks.InputError(f"a time course needs two frames, and {results.path} has one")
-        frames = RecordedFrames(results, range(len(results)))
-        most = most if by is None else min(most, len(STYLES))
-        places, more = choose_colonies(frames.shown(False), results.colony_id, colonies, most)
-        wanted = quantities if by is None else (*quantities, by)
-        each = known_quantities(results, *wanted)
+        frames, times = RecordedFrames(results, range(len(results))), results.times
+        names = condition_names(results, conditions)
+        places, more = _places(frames, names, colonies, most if by is None else len(STYLES))
+        each = known_quantities(results, *(VOLUME if q == BIOVOLUME else q for q in quantities),
+                                by=by)  # fmt: skip
         found = [_seen(cells, known, places, by, quantities) for cells, known in each]
-        lines = _lines(places, sorted({kind for one in found for _, kind in one}), by, frames)
+        kinds = sorted({kind for one in found for _, kind in one})
+        lines = _lines({p: names[p] for p in places}, kinds, by, frames)
         none = np.full((1 + len(quantities), 3), np.nan)
         seen = np.stack([[one.get((x.place, x.kind), none) for x in lines] for one in found])
+        seen[:, :, 0][seen[:, :, 0] == 0] = np.nan
+        failed = _failed(results, seen[-1, :, 0, 0], lines)
         figure = new_figure(WIDE, HIGH * (1 + len(quantities)) + 0.3, dpi)
         axes = list(figure.subplots(1 + len(quantities), 1, sharex=True, squeeze=False)[:, 0])
-        seen[:, :, 0][seen[:, :, 0] == 0] = np.nan
-        each_label = Counter(x.label for x in lines)
-        for k, line in enumerate(lines):
-            band, several = len(lines) <= FEW, each_label[line.label] > 1
-            _draw(axes, results.times, seen[:, k], line, band and not several, several)
-            _draw_none(axes[0], results.times, seen[:, k, 0, 0], line, several)
-        for label in (n for n, count in each_label.items() if count > 1):
-            same = [k for k, x in enumerate(lines) if x.label == label]
-            first = replace(lines[same[0]], label=f"{label}, mean of {len(same)}")
-            _draw(axes, results.times, _mean(seen[:, same]), first)
-        _finish(axes[0], "cells", _scale_of_counts(seen[:, :, 0, 0]))
-        for row, name in enumerate(quantities):
-            unit = unit_at_cells(results, name)
-            some = bool((seen[:, :, 1 + row] > 0).any())  # or there is no logarithm
-            scale = "log" if log and some else "linear"
-            _finish(axes[1 + row], f"mean of {name}" + f" ({unit})" * bool(unit), scale)
+        labels = list(dict.fromkeys(x.label for x in lines))
+        for label in labels:
+            same = np.array([k for k, x in enumerate(lines) if x.label == label])
+            _draw_alike(axes, times, seen[:, same], [lines[k] for k in same], failed[same],
+                        band=len(lines) <= FEW, sums=_sums(quantities))  # fmt: skip
+        _finish_all(axes, results, quantities, seen, log)
         axes[-1].set_xlabel("time (h)")
-        ends = results.times[[0, -1]]  # of the run, also where its last cell died before
+        ends = times[[0, -1]]  # of the run, also where its last cell died before
         axes[-1].set_xlim(*(ends + 0.05 * np.diff(ends) * [-1, 1]))
         if len(results.colony_id) > 1 or by is not None:
             _legend(axes[0])
@@ -108,32 +111,97 @@ class CourseLine:
     style: str
 
 
+def _places(
+    frames: RecordedFrames, names: Mapping[int, str], colonies: Sequence[int] | None, most: int
+) -> tuple[list[int], str]:
+    """The places of the colonies to draw, and a note for the title if some are omitted. names: of
+    conditions, by place; most: of these at most so many, by default."""
+    checks.integer("most", most, least=1)
+    ids = frames.results.colony_id
+    found, more = choose_colonies(frames.shown(False), ids, colonies, len(ids))
+    places = [p for p in found if p in names]
+    if not places:
+        rule = "names of colonies that are drawn and have cells"
+        raise checks.input_error("conditions", list(names.values()), rule)
+    each = list(dict.fromkeys(names[p] for p in places))
+    if colonies is not None or len(each) <= most:
+        return places, more
+    kind = "colonies" if len(each) == len(places) else "conditions"
+    note = f"first {most} of {len(each)} {kind}"
+    return [p for p in places if names[p] in each[:most]], f" ({note}{more and ', ' + more[2:-1]})"
+
+
+def _sums(quantities: Sequence[str]) -> list[int]:
+    """The panels whose values are of all cells of a colony, 0 without cells."""
+    return [0, *(1 + k for k, name in enumerate(quantities) if name == BIOVOLUME)]
+
+
+def _draw_alike(
+    axes: Sequence[Axes], times: np.ndarray, seen: np.ndarray, lines: Sequence[CourseLine],
+    failed: np.ndarray, *, band: bool, sums: Sequence[int],
+) -> None:  # fmt: skip
+    """Draw the lines of one condition, (frames, lines, panels, 3), and their mean if they are
+    several. failed: (lines,) whose colony has failed."""
+    several, many = len(lines) > 1, len(lines) > MANY
+    for k, line in enumerate(lines if not many else ()):
+        _draw(axes, times, seen[:, k], line, band and not several, several)
+        _draw_end(axes[0], times, seen[:, k, 0, 0], line, several, bool(failed[k]))
+    if not several:
+        return
+    filled = seen.copy()
+    for panel in sums:  # those that have died out count
+        gone = _gone(seen[:, :, 0, 0]) & ~failed
+        filled[:, :, panel][gone] = 0.0
+    mean = _mean(filled)
+    if many:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of a frame without any cell
+            mean[:, :, 1:] = np.nanpercentile(filled[..., 0], BAND, axis=1).transpose(1, 2, 0)
+    first = replace(lines[0], label=f"{lines[0].label}, mean of {len(lines)}")
+    _draw(axes, times, mean, first, band=many, of_counts=many)
+
+
 def _draw(
     axes: Sequence[Axes], times: np.ndarray, seen: np.ndarray, line: CourseLine,
-    band: bool = False, thin: bool = False,
+    band: bool = False, thin: bool = False, of_counts: bool = False,
 ) -> None:  # fmt: skip
-    """Draw one line in each panel, and below the first the band of the cells. seen: of each frame,
-    (frames, panels, 3): the value, and the ends of the band. thin: one of several replicates."""
+    """Draw one line in each panel, and a band below the first, or in each if `of_counts`. seen: of
+    each frame, (frames, panels, 3): the value, and the ends of the band. thin: one of several
+    replicates."""
     width: dict[str, Any] = {"lw": 0.5, "alpha": 0.7} if thin else {"lw": 1.2}
     label = None if thin else line.label
     for row, ax in enumerate(axes):
         value, low, high = seen[:, row].T
         ax.plot(times, value, color=line.colour, ls=line.style, label=label, **width)
-        if band and row:
+        if band and (row or of_counts):
             ax.fill_between(times, low, high, color=line.colour, alpha=0.2, lw=0)
 
 
-def _draw_none(
-    ax: Axes, times: np.ndarray, counts: np.ndarray, line: CourseLine, thin: bool
+def _draw_end(
+    ax: Axes, times: np.ndarray, counts: np.ndarray, line: CourseLine, thin: bool, failed: bool
 ) -> None:
-    """Mark where the cells of a line die out, and draw that there are 0 from then on. counts: of
-    each frame; NaN without cells."""
-    gone = _gone(counts)
+    """Mark where the cells of a line die out, and draw that there are 0 from then on; or where its
+    colony fails. counts: of each frame; NaN without cells."""
+    gone, size = _gone(counts), 12 if thin else 30
+    if failed:
+        last = np.flatnonzero(~np.isnan(counts))[-1:]
+        ax.scatter(times[last], counts[last], s=size, color=line.colour, marker="x", zorder=3)
+        return
     change = np.diff(gone.astype(int), prepend=0, append=0)
     begin, end = np.flatnonzero(change == 1), np.flatnonzero(change == -1) - 1
     zero, lw = np.zeros(len(begin)), 0.5 if thin else 1.2
     ax.hlines(zero, times[begin], times[end], color=line.colour, ls=line.style, lw=lw)
-    ax.scatter(times[begin], zero, s=12 if thin else 30, color=line.colour, marker="v", zorder=3)
+    ax.scatter(times[begin], zero, s=size, color=line.colour, marker="v", zorder=3)
+
+
+def _failed(results: Results, last: np.ndarray, lines: Sequence[CourseLine]) -> np.ndarray:
+    """(lines,) of which colonies the run was stopped by an error. last: numbers of cells in the
+    last frame, NaN for none."""
+    if not np.isnan(last).any():
+        return np.zeros(len(lines), bool)
+    tree = results.lineage()
+    failed = np.unique(tree.colony[tree.fate == "failed"])
+    return np.isin(results.colony_id[[x.place for x in lines]], failed)
 
 
 def _gone(counts: np.ndarray) -> np.ndarray:
@@ -159,27 +227,23 @@ def _mean(seen: np.ndarray) -> np.ndarray:
 
 
 def _lines(
-    places: Sequence[int], kinds: Sequence[int], by: str | None, frames: RecordedFrames
+    named: Mapping[int, str], kinds: Sequence[int], by: str | None, frames: RecordedFrames
 ) -> list[CourseLine]:
-    """One for each colony, or for each kind of each. Without kinds, replicates have the label and
-    the colour in common."""
-    named = {p: frames[0].name(p) for p in places}
+    """One for each colony, or for each kind of each. Those of one condition, a name by place, have
+    the label and the colour in common; or with kinds, the style."""
     labels = list(dict.fromkeys(named.values()))
     if by is None:
         colours = dict(zip(labels, _colours(len(labels)), strict=True))
         return [CourseLine(p, ALL, name, colours[name], "-") for p, name in named.items()]
-    if len(labels) < len(named):
-        ids = frames.results.colony_id
-        named = {p: f"{name}, colony {ids[p]}" for p, name in named.items()}
-    name = named.__getitem__
-    if len(places) > len(STYLES):
-        rule = f"up to {len(STYLES)} colonies where cells are told apart by {by!r}"
-        raise checks.input_error("colonies", [name(p) for p in places], rule)
+    if len(labels) > len(STYLES):
+        rule = f"colonies of up to {len(STYLES)} conditions where cells are told apart by {by!r}"
+        raise checks.input_error("colonies", labels, rule, "See conditions=…")
     several, own = len(frames[0].counts) > 1, frames[0].type_names if by == TYPES else ()
     kind_name = {k: own[k] if 0 <= k < len(own) else f"{by} {k}" for k in kinds}
+    styles = dict(zip(labels, STYLES, strict=False))
     return [
-        CourseLine(p, kind, f"{name(p)}, " * several + kind_name[kind], c, style)
-        for p, style in zip(places, STYLES, strict=False)
+        CourseLine(p, kind, f"{name}, " * several + kind_name[kind], c, styles[name])
+        for p, name in named.items()
         for kind, c in zip(kinds, _colours_of(kinds, by), strict=True)
     ]
 
@@ -188,7 +252,7 @@ def _seen(
     cells: Columns, known: Columns, places: Sequence[int], by: str | None, names: Sequence[str]
 ) -> dict[tuple[int, int], np.ndarray]:
     """Of the cells of each place and kind their number, three times, and of each quantity the mean,
-    and the ends of the band, (1 + quantities, 3); NaN without cells."""
+    and the ends of the band, (1 + quantities, 3), or three times the sum; NaN without cells."""
     kind = np.full(len(cells["uid"]), ALL) if by is None else known[by]
     if kind.dtype.kind not in "iub":
         raise checks.input_error("by", by, "a field of whole numbers, such as 'cell_type'")
@@ -199,8 +263,10 @@ def _seen(
             found = np.full((1 + len(names), 3), np.nan)
             found[0] = mine.sum()
             for row, name in enumerate(names):
-                values = known[name][mine].astype(float)
-                if len(values):
+                values = known[VOLUME if name == BIOVOLUME else name][mine].astype(float)
+                if name == BIOVOLUME and len(values):
+                    found[1 + row] = values.sum()
+                elif len(values):
                     found[1 + row] = values.mean(), *np.percentile(values, BAND)
             out[place, one] = found
     return out
@@ -224,9 +290,27 @@ def _colours(count: int) -> list[Any]:
 
 def _legend(ax: Axes) -> None:
     """Name the lines, beside the first panel."""
-    made = ax.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    columns = -(-len(ax.get_legend_handles_labels()[1]) // TALL)
+    made = ax.legend(
+        fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5), ncols=columns
+    )
     for text in made.get_texts():
         text.set_parse_math(False)  # names may hold a $
+
+
+def _finish_all(
+    axes: Sequence[Axes], results: Results, quantities: Sequence[str], seen: np.ndarray, log: bool
+) -> None:
+    """Label the panels and scale their axes. seen: (frames, lines, panels, 3)."""
+    _finish(axes[0], "cells", _scale_of_counts(seen[:, :, 0, 0]))
+    for row, name in enumerate(quantities):
+        total = name == BIOVOLUME
+        unit = "µm³" if total else unit_at_cells(results, name)
+        some = bool((seen[:, :, 1 + row] > 0).any())  # or there is no logarithm
+        words = name if total else f"mean of {name}"
+        _finish(
+            axes[1 + row], words + f" ({unit})" * bool(unit), "log" if log and some else "linear"
+        )
 
 
 def _finish(ax: Axes, label: str, scale: str) -> None:
@@ -234,6 +318,8 @@ def _finish(ax: Axes, label: str, scale: str) -> None:
     ax.set_ylabel(label, parse_math=False)
     more = {"linthresh": 1.0, "linscale": 0.5, "subs": range(2, 10)} if scale == "symlog" else {}
     ax.set_yscale(scale, **more)
+    if more:  # a margin below 0 as narrow as that above, whatever is filled
+        ax.set_ylim(bottom=max(ax.get_ylim()[0], -0.25))
     ax.grid(False)
     for side in ("top", "right"):
         ax.spines[side].set_visible(False)
