@@ -161,6 +161,13 @@ def test_they_may_differ_between_colonies(form):
     assert strains(first) == [(4, 0), (4, 4), (0, 2)]
 
 
+def test_values_of_single_precision_are_those_that_were_typed():
+    """So rows of tables can be selected by them."""
+    for given in (torch.tensor([0.1, 0.9]), np.array([0.1, 0.9], np.float32)):
+        (of_share,) = scene(tf.Founders(shared, share=given)).per_colony()
+        assert of_share[0] == "Founders.share" and of_share[1].tolist() == [0.1, 0.9]
+
+
 def test_colonies_of_one_stream_differ_by_their_values_alone():
     def placed(seed, share):
         cells = tf.inoculum(4, RADIUS, seed=seed)

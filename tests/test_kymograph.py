@@ -128,6 +128,14 @@ def test_a_range_without_cells_is_refused(tmp_path, edges):
         tf.pictures.kymograph(path, "length", edges=edges)
 
 
+def test_edges_are_several_and_names_as_they_are_written(tmp_path):
+    path = still(tmp_path / "run.h5")
+    with pytest.raises(tf.InputError, match=r"edges\) = 10.*two or more, µm, ascending. Such as"):
+        tf.pictures.kymograph(path, "length", edges=10)
+    with pytest.raises(tf.InputError, match="Did you mean 'length'"):
+        tf.pictures.kymograph(path, "LENGTH")
+
+
 def test_a_frame_without_cells_is_empty(tmp_path):
     path = tmp_path / "gone.h5"
     scene = tf.Scene(tf.Growth(rate=0.0), founders=tf.Cells(PLACES, [1.0, 0.0]), dim=2, dt=0.1)

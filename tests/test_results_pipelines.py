@@ -143,6 +143,8 @@ def test_tracks_of_a_challenge_end_where_the_movie_did(tmp_path):
     assert read(end=5.0) == ["divided", "lost", "lost"]
     with pytest.raises(tf.InputError, match=r"from_ctc\(end\) = 1.*at least 3"):
         read(end=1.0)
+    with pytest.raises(tf.InputError, match="from_ctc: missing a required argument: 'interval'"):
+        tf.Lineage.from_ctc(path)
 
 
 @pytest.mark.parametrize("kind", ["timedelta64[ns]", "datetime64[ns]", "timedelta64[m]"])

@@ -202,7 +202,11 @@ def _each(name: str, given: Any) -> Any:
         rule = "numbers without gradients"
         hint = "Where colonies start has no derivatives: search this one without them."
         raise checks.input_error(f"Founders.{name}", "a tensor that requires gradients", rule, hint)
-    if isinstance(given, np.ndarray | Tensor):
+    if isinstance(given, Tensor):
+        given = given.cpu().numpy()
+    if isinstance(given, np.ndarray):
+        if given.dtype == np.float32:  # the decimals that were typed, 0.1 and not 0.10000000149
+            given = given.astype(str).astype(np.float64)
         given = given.tolist()
     if not isinstance(given, list):
         return given

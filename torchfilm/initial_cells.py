@@ -232,17 +232,17 @@ class Cells(metaclass=checks.KnownKeywords):
 
         Raises InputError for a column that is missing, has no unit, is not numbers or is used
         twice, for rows with one label or one place, for several frames, and for arguments that
-        nothing uses. Warns of angles that cannot be in their unit, and of widths that no bacteria
-        have.
+        nothing uses. Warns of angles that cannot be in their unit, and of widths and lengths that
+        no bacteria have.
         """
         from torchfilm.micrographs.cell_tables import Reading, table_cells
-        from torchfilm.micrographs.record import with_usual_widths
+        from torchfilm.micrographs.record import with_usual_sizes
 
         reading = Reading(
             pixel_size, length_unit, columns, angle_unit, angle_turns, y, length_with_caps, radius,
             frame, fields, centre,
         )  # fmt: skip
-        cells = with_usual_widths(Cells(**table_cells(Table.read(table), reading)))
+        cells = with_usual_sizes(Cells(**table_cells(Table.read(table), reading)))
         _warn_of_empty(cells)
         return cells
 
@@ -281,7 +281,7 @@ class Cells(metaclass=checks.KnownKeywords):
         their labels. drop: the kinds to leave out instead, such as "border" or ("border", "tiny").
         """
         from torchfilm.micrographs.masks import mask_cells
-        from torchfilm.micrographs.record import with_usual_widths
+        from torchfilm.micrographs.record import with_usual_sizes
 
         given = mask_cells(
             image,
@@ -293,7 +293,7 @@ class Cells(metaclass=checks.KnownKeywords):
             least_area=least_area,
             centre=centre,
         )
-        return with_usual_widths(Cells(**given))
+        return with_usual_sizes(Cells(**given))
 
     @staticmethod
     @checks.known_keywords

@@ -251,6 +251,7 @@ class CellsView(StepDraws, SurroundingsView):
                 f"{near_name(name, known)} Give a variable of your own another name."
             )
         near = difflib.get_close_matches(name, known, 1, cutoff=0.82)
+        near = near or [n for n in known if len(n) > 2 and sorted(n) == sorted(name)]  # gpf for gfp
         if near:
             raise RuleError(
                 f"cells.{name} is new: did you mean {near[0]!r}? If it is a variable of your"

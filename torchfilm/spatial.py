@@ -4,7 +4,7 @@ distance of two cells."""
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -55,6 +55,9 @@ def kinds_of(measure: str, state: State, name: object) -> Tensor:
 def checked_edges(measure: str, edges: Any, least: float = -torch.inf) -> list[float]:
     """Ascending edges of bins, µm. Raises InputError, which names the measure, for others."""
     given = edges.tolist() if isinstance(edges, Tensor) else edges
+    if not isinstance(given, Iterable):
+        rule = "two or more, µm, ascending"
+        raise checks.input_error(f"{measure}(edges)", edges, rule, "Such as range(0, 21, 2).")
     found = [checks.number(f"{measure}(edges)", e, least=least) for e in given]
     if len(found) < 2 or any(b <= a for a, b in itertools.pairwise(found)):
         raise checks.input_error(f"{measure}(edges)", list(edges), "two or more, µm, ascending")

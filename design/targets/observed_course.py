@@ -22,6 +22,7 @@ from design.targets.observed_frames import (
     measured_frames,
     results_frames,
     state_frames,
+    table_frames,
 )
 from design.targets.observed_measures import MeasureStatistics, ObservedMeasures, as_data
 from design.targets.observed_values import warn_of_width
@@ -172,11 +173,7 @@ class ObservedCourse(Observed):
                 f"{given.source}, column {column!r}: {len(each)} times in {len(times)} rows. Cells"
                 " of one frame have the same time: round those that the instrument noted."
             )
-        frames = []
-        for t in each:
-            part: Any = given.take(times == t)
-            frames.append(Observed.from_table(part, columns=columns, time=float(t), **options))
-        return ObservedCourse(frames)
+        return ObservedCourse(table_frames(given, times, columns, options))
 
     @staticmethod
     @checks.known_keywords

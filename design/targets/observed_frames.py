@@ -11,7 +11,8 @@ import numpy as np
 import torchfilm as tf
 from design.targets.measured import Measured, checked_columns, means_and_spreads
 from design.targets.observed import Observed
-from torchfilm import checks
+from design.targets.observed_table import colonies_of
+from torchfilm import checks, tables
 
 MEASURES = "ObservedCourse.of_measures"
 
@@ -59,6 +60,35 @@ def results_frames(path: Any, frames: Any, options: Mapping[str, Any]) -> list[O
         rule = "a list of frames, or None"
         raise checks.input_error("ObservedCourse.from_results: frames", frames, rule)
     return [Observed.from_results(path, frame, **options) for frame in frames]
+
+
+def table_frames(
+    given: tables.Table, times: np.ndarray, columns: Mapping[str, str], options: Mapping[str, Any]
+) -> list[Observed]:
+    """The rows of each time of a table. times: of the rows, h. Warns of colonies that are gone
+    later."""
+    frames: list[Observed] = []
+    for t in np.unique(times):
+        part: Any = given.take(times == t)
+        frames.append(Observed.from_table(part, columns=columns, time=float(t), **options))
+    if (owner := colonies_of(given, columns)) is not None:
+        _warn_of_gone(given.source, {k: float(times[owner == k].max()) for k in np.unique(owner)})
+    return frames
+
+
+def _warn_of_gone(source: str, last: Mapping[Any, float]) -> None:
+    """Warn of colonies that are gone in later frames. last: h, when each was seen last."""
+    end = max(last.values())
+    gone = [str(k) for k, t in last.items() if t < end]
+    if gone:
+        shown = ", ".join(gone[:8]) + ", …" * (len(gone) > 8)
+        checks.warn(
+            f"{source}: {len(gone)} of {len(last)} colonies are not there any more at {end:g} h"
+            f" ({shown}). If they died out, the frames are of those that live on, while simulated"
+            " colonies that die out fail: a search then finds fewer deaths than there were."
+            " Measured(…, extinct=True) and ObservedCourse.of_measures(…, extinct=True) measure"
+            " those, too."
+        )
 
 
 def _check_count(what: str, given: Any, count: int) -> None:

@@ -21,6 +21,7 @@ TIMES = (
     "hours", "minute", "minutes",
 )  # fmt: skip
 KIND = {"x": "length", "y": "length", "length": "length", "angle": "angle", "age": "time"}
+LONGEST = 100.0  # µm, the median of bacteria, filaments aside
 ROUNDED = 1e-3  # share by which a time may differ from that of a column
 
 
@@ -50,7 +51,7 @@ def read_table(
     for name in columns:
         checks.choice("Observed(columns)", name, meant)
     _check_one_frame(given, columns)
-    owner = _colonies(given, columns)
+    owner = colonies_of(given, columns)
     _check_one_time(given, columns, owner)
     found: dict[str, Tensor] = {}
     used: set[tuple[str, str]] = set()
@@ -63,6 +64,7 @@ def read_table(
         if name in ("length", "age"):
             _check_positive(given, column, numbers, name == "length" and length_with_caps)
         found[name] = factor * torch.tensor(numbers)  # pandas may give what is read-only
+    _warn_of_length(given, found.get("length", torch.zeros(0)))
     time = _time(given, columns, units, time)
     units.check_used(used)
     for name in species:
@@ -210,7 +212,7 @@ def _cells(
     )
 
 
-def _colonies(table: tables.Table, columns: Mapping[str, str]) -> np.ndarray | None:
+def colonies_of(table: tables.Table, columns: Mapping[str, str]) -> np.ndarray | None:
     """Which colony each cell belongs to, as given but for space around a name; None: all to one."""
     column = columns.get(COLONY, COLONY)
     if column in table.columns:
@@ -232,6 +234,15 @@ def _colonies(table: tables.Table, columns: Mapping[str, str]) -> np.ndarray | N
     if COLONY in columns:
         raise table.missing(column)
     return None
+
+
+def _warn_of_length(given: tables.Table, length: Tensor) -> None:
+    """Warn of cells, µm, that are longer than bacteria are."""
+    if len(length) and float(length.median()) > LONGEST:
+        checks.warn(  # the same words for each frame of a course, to be read once
+            f"{given.source}: cells are longer than {LONGEST:g} µm (median), as bacteria rarely are."
+            " Lengths are in µm, or in pixels with pixel_size in µm, not in nm."
+        )
 
 
 def warn_of_empty(results: tf.Results, table: Mapping[str, np.ndarray]) -> None:

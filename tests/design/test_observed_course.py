@@ -88,6 +88,23 @@ def test_times_that_differ_from_cell_to_cell_are_warned_of():
         ObservedCourse.from_table(table)
 
 
+def test_colonies_that_are_gone_are_warned_of(tmp_path):
+    """A fit to those that live on would find too few deaths."""
+    table = {"time_h": [1.0, 1.0, 1.0, 2.0, 2.0], "colony": ["a", "b", "c", "b", "c"],
+             "length_um": [2.0, 2.1, 2.2, 2.3, 2.4]}  # fmt: skip
+    with pytest.warns(UserWarning, match=r"1 of 3 colonies .* any more at 2 h \(a\).*extinct=True"):
+        ObservedCourse.from_table(table)
+    later = {name: column[1:] for name, column in table.items()}  # b and c from the first on
+    ObservedCourse.from_table(later)
+
+
+def test_lengths_in_nanometres_are_warned_of():
+    table = {"time_h": [1.0, 1.0, 2.0, 2.0], "length_px": [40.0, 44.0, 50.0, 52.0]}
+    with pytest.warns(UserWarning, match=r"longer than 100 µm \(median\).*not in nm"):
+        ObservedCourse.from_table(table, pixel_size=65.0)
+    ObservedCourse.from_table(table, pixel_size=0.065)
+
+
 def test_a_colony_that_was_not_seen_has_no_statistics(course):
     states = list(tf.simulate(colony(), until=2.0, dt=0.1, colonies=2, seed=8))
     late = torch.stack([course.note(s) for s in states[15:]])

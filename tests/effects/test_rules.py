@@ -357,6 +357,15 @@ def test_a_wrong_shape_is_reported_before_anything_runs(shape):
         ).bind().start()
 
 
+def test_letters_that_changed_places_are_a_slip():
+    def rule(cells):
+        cells.gpf = 1.0
+
+    scene = tf.Scene(tf.Rules(rule, variables={"gfp": 0.0}), dim=2)
+    with pytest.raises(tf.InputError, match=r"cells\.gpf is new: did you mean 'gfp'"):
+        scene.bind()
+
+
 def test_a_new_variable_of_wrong_length_is_reported():
     with pytest.raises(ValueError, match=r"cells\.mine.*shape"):
         tf.Scene(tf.Rules(write("mine", torch.ones(5))), founders=pair_of_cells()).bind().start()

@@ -457,3 +457,12 @@ def test_cells_of_a_table_start_a_run():
     )
     *_, state = tf.simulate(scene, until=0.2, dt=0.05)
     assert state.cells == 2 and torch.isfinite(state.position).all()
+
+
+def test_lengths_that_no_bacteria_have_are_noticed():
+    """As with a pixel size in nm, where no column says how wide the cells are."""
+    columns = {"x_px": [10.0, 90.0], "y_px": [0.0, 0.0], "length_px": [40.0, 50.0],
+               "angle_rad": [0.0, 1.0]}  # fmt: skip
+    with pytest.warns(UserWarning, match=r"2\.93e\+03 µm long with their caps.* = 65 µm right"):
+        tf.Cells.from_table(columns, pixel_size=65.0, y="up")
+    assert tf.Cells.from_table(columns, pixel_size=0.065, y="up").count == 2

@@ -168,7 +168,8 @@ def _masks(view: View, tracks: LabelTracks) -> Iterator[np.ndarray]:
     if not tracks.found:
         raise InputError(
             f"colony {view.colony} of {view.results.path} has no cell in these images: there is"
-            " nothing to track. Choose another window, or other frames."
+            " nothing to track. Choose another window, other frames, or smaller pixels"
+            f" (pixel_size = {view.raster.pixel:g} µm)."
         )
     _warn_of(hidden, empty)
 

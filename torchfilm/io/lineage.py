@@ -141,8 +141,7 @@ class Lineage:
         join: bool = False,
         end: float | None = None,
     ) -> Lineage:
-        """Cells that a microscope has followed: a row for each cell in each frame, of a CSV file or
-        of columns by name.
+        """Cells of a movie: a row for each cell in each frame, of a CSV file or of columns by name.
 
         Columns: cell, a number; parent, that of the cell from which it descends, −1, 0 (where no
         cell is 0) or nothing where none is known; time; length, which may be missing; colony, a
@@ -162,6 +161,7 @@ class Lineage:
         return Lineage._of_tracks(table_tracks(table, columns or {}, units, width, join, end))
 
     @staticmethod
+    @checks.known_keywords
     def from_ctc(
         path: str | Path, *, interval: float, join: bool = False, end: float | None = None
     ) -> Lineage:

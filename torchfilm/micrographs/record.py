@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 
 WIDTHS = 0.2, 5.0  # µm, of bacteria
+LONGEST = 100.0  # µm, a median, filaments aside
 LEAST = 0.01  # µm; overlaps below it are not worth a word
 
 
@@ -56,20 +57,26 @@ def listed(labels: Sequence[str], most: int = 8) -> str:
     return ", ".join(labels[:most]) + (f", … ({len(labels)} in all)" if len(labels) > most else "")
 
 
-def with_usual_widths(cells: Cells) -> Cells:
-    """The same cells; warns where their median width is not that of bacteria."""
+def with_usual_sizes(cells: Cells) -> Cells:
+    """The same cells; warns where their median width or length is not that of bacteria."""
     if not cells.count:
         return cells
     width, seen = float(np.median(2 * cells.radius)), cells.micrograph
+    whole = float(np.median(cells.length + 2 * cells.radius))
+    hint = (
+        "Are the columns in µm? For pixels give pixel_size, in µm."
+        if seen is None
+        else f"Is pixel_size = {seen.pixel_size:g} µm right? It is not in nm."
+    )
     if not WIDTHS[0] <= width <= WIDTHS[1]:
-        hint = (
-            "Are the columns in µm? For pixels give pixel_size, in µm."
-            if seen is None
-            else f"Is pixel_size = {seen.pixel_size:g} µm right? It is not in nm."
-        )
         warn(
             f"the cells are {width:.3g} µm wide (median); bacteria are {WIDTHS[0]:g} to"
             f" {WIDTHS[1]:g} µm wide. {hint}"
+        )
+    elif not WIDTHS[0] <= whole <= LONGEST:
+        warn(
+            f"the cells are {whole:.3g} µm long with their caps (median); bacteria are"
+            f" {WIDTHS[0]:g} to {LONGEST:g} µm long. {hint}"
         )
     return cells
 

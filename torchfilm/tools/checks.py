@@ -63,7 +63,8 @@ def nearest(given: str, known: Iterable[str]) -> str | None:
     """The known name that was probably meant: a similar one, or one that begins the given name or
     begins with it ("dim" for "dimension"). None: no name is near."""
     known = list(known)
-    near = difflib.get_close_matches(given, known, n=1)
+    near = [n for n in known if n.lower() == given.lower()]
+    near = near or difflib.get_close_matches(given, known, n=1)
     if near:
         return near[0]
     begins = (n for n in known if len(min(n, given, key=len)) >= 3)
