@@ -168,6 +168,32 @@ def test_values_of_single_precision_are_those_that_were_typed():
         assert of_share[0] == "Founders.share" and of_share[1].tolist() == [0.1, 0.9]
 
 
+def test_texts_are_kept_in_results_and_name_colonies(tmp_path):
+    """Through a resume, too, and beside numbers; in the order of the colonies of the run."""
+    path = tmp_path / "run.h5"
+
+    def made(seed, kind, size):
+        return tf.inoculum({"few": 1, "many": 3}[kind], 5.0, seed=seed)
+
+    values = {"kind": ["few", "many", "few"], "size": [1.0, 1.0, 2.0]}
+    few_or_many = scene(tf.Founders(made, **values))
+    start = few_or_many.bind(seed=1).start().select([2, 1, 0])
+    state = tf.simulate(few_or_many, start, until=0.2, record=path).last()
+    tf.simulate(few_or_many, state, until=0.4, record=tf.Recorder(path, few_or_many, append=True))
+    with tf.Results(path) as results:
+        kept = results.parameters()
+        assert kept["Founders.kind"].tolist() == ["few", "many", "few"]
+        assert kept["Founders.size"].tolist() == [2.0, 1.0, 1.0]
+        table = results.table(-1)
+        assert dict(zip(table["colony"].tolist(), table["kind"].tolist(), strict=True)) == {
+            2: "few", 1: "many", 0: "few",
+        }  # fmt: skip
+        results.to_vtkhdf(tmp_path / "run.vtkhdf")
+    figure = tf.pictures.time_course(path, conditions="kind").figure
+    names = [text.get_text() for text in figure.axes[0].get_legend().texts]
+    assert names == ["kind = few, mean of 2", "kind = many"]
+
+
 def test_colonies_of_one_stream_differ_by_their_values_alone():
     def placed(seed, share):
         cells = tf.inoculum(4, RADIUS, seed=seed)

@@ -102,6 +102,11 @@ class Founders:
             if all(isinstance(one, bool | int | float) for one in x)
         ]
 
+    def words(self) -> dict[str, list[str]]:
+        """The texts that differ between colonies, by name: "Founders.kind"."""
+        lists = {f"Founders.{n}": x for n, x in self.values.items() if isinstance(x, list)}
+        return {n: x for n, x in lists.items() if all(isinstance(one, str) for one in x)}
+
     def check_colonies(self, count: int) -> None:
         """Raise InputError unless there is a value for each of so many colonies."""
         if self.colonies not in (None, count):

@@ -240,8 +240,8 @@ def _warn_of_length(given: tables.Table, length: Tensor) -> None:
     """Warn of cells, µm, that are longer than bacteria are."""
     if len(length) and float(length.median()) > LONGEST:
         checks.warn(  # the same words for each frame of a course, to be read once
-            f"{given.source}: cells are longer than {LONGEST:g} µm (median), as bacteria rarely are."
-            " Lengths are in µm, or in pixels with pixel_size in µm, not in nm."
+            f"{given.source}: cells are longer than {LONGEST:g} µm (median), as bacteria rarely"
+            " are. Lengths are in µm, or in pixels with pixel_size in µm, not in nm."
         )
 
 

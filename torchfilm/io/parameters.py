@@ -1,6 +1,7 @@
 """The parameters of a run that have one value per colony, kept in its results file.
 
-/parameters/PATH             (B,), by the colonies' places; PATH as `Scene.per_colony` names it
+/parameters/PATH             (B,), by the colonies' places; PATH as `Scene.per_colony` names it;
+                             texts of founders, too
 /parameters_until/STEP/PATH  (B,), of frames up to STEP, where a resume changed the parameters
 """
 
@@ -36,6 +37,8 @@ def write_parameters(
     earlier, own = f"{UNTIL}/{step}", numpy_of(colony_id)
     of_founders = lambda path: path.startswith(f"{Founders.__name__}.")
     given = {path: numpy_of(x)[own] for path, x in scene.per_colony()}
+    if scene.draw is not None:
+        given |= {path: np.array(x)[own] for path, x in scene.draw.words().items()}
     if NOW in file or not by_founders:
         given = {path: x for path, x in given.items() if not of_founders(path)}
     if NOW in file:
@@ -51,22 +54,24 @@ def write_parameters(
         file.create_group(earlier)
     group = file.create_group(NOW)
     for path, value in given.items():
-        group.create_dataset(path.replace("/", SLASH), data=_as_typed(value))
+        data = value.astype(object) if value.dtype.kind == "U" else _as_typed(value)
+        group.create_dataset(path.replace("/", SLASH), data=data)
 
 
 def parameters_at(file: h5py.File, step: int) -> dict[str, np.ndarray]:
-    """The values at a step by path, (B,) each; NaN where a parameter had then no value per colony.
-    Empty for files of earlier versions, which do not hold them."""
+    """The values at a step by path, (B,) each; NaN where a parameter had then no value per colony,
+    of texts "". Empty for files of earlier versions, which do not hold them."""
     if NOW not in file:
         return {}
     with blaming_file(file, NOW):
         found = _values(file[NOW])
-        names, size = set(found), len(file["colony_id"])
+        every, size = dict(found), len(file["colony_id"])
         for until in sorted(map(int, file.get(UNTIL, {})), reverse=True):
             earlier = _values(file[f"{UNTIL}/{until}"])
-            names |= set(earlier)
+            every |= earlier
             found = earlier if step <= until else found
-        return {name: found.get(name, np.full(size, np.nan)) for name in sorted(names)}
+        none = lambda x: np.full(size, "" if x.dtype.kind == "U" else np.nan)
+        return {name: found.get(name, none(every[name])) for name in sorted(every)}
 
 
 def last_steps(file: h5py.File) -> list[int]:
@@ -90,7 +95,8 @@ def _values(group: h5py.Group) -> dict[str, np.ndarray]:
     # earlier versions wrote the centre of a sphere so
     now = lambda name: re.sub(r"^(Mechanics\.walls\[\d+\])\.center\b", r"\1.centre", name)
     path = lambda name: now(name.replace(SLASH, "/"))
-    return {path(name): x[...] for name, x in group.items()}
+    read = lambda x: x.asstr()[...].astype(str) if x.dtype.kind == "O" else x[...]
+    return {path(name): read(x) for name, x in group.items()}
 
 
 def column_names(paths: list[str], taken: set[str]) -> dict[str, str]:

@@ -31,7 +31,9 @@ def _joined(columns: Mapping[str, np.ndarray]) -> list[str]:
 
 
 def _words(values: np.ndarray) -> list[str]:
-    """Numbers as text, with as many digits as it takes to tell them apart."""
+    """Numbers as text, with as many digits as it takes to tell them apart; texts as they are."""
+    if values.dtype.kind == "U":
+        return list(values.tolist())
     for digits in range(4, 18):
         words = [f"{value:.{digits}g}" for value in values.tolist()]
         if len(set(words)) == len(np.unique(values)):
