@@ -137,7 +137,7 @@ def _write_cells(
             ends = _flat(mesh.offsets[1:] + before * sizes[2])
             _add(room, root[topology]["Offsets"], np.concatenate([[0], ends]))
         for name, value in columns.items():
-            if name not in LEFT_OUT:
+            if name not in LEFT_OUT and value.dtype.kind != "U":  # viewers colour by numbers
                 column = _plain(value)
                 if name not in data:
                     _growing(data, name, column.dtype)

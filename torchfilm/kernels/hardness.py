@@ -45,30 +45,23 @@ def of_colony(base, growth, radius, drag, hardness, settings):
 
 
 @lean
-def most_force(x, y, scale, radius, growth, drag, reach, is_soft, dof):
-    """What bounds the mean force of contacts, as forces times Δt: the greatest that growth may
-    exert, and the sum over all contacts that the scaled moves y need. Where cells stick or walls
-    are soft, these push as well, and nothing bounds it."""
-    n, d = x.shape[0], 2 if len(dof) == 4 else 3
-    held, moved, centre = 0.0, 0.0, (0.0, 0.0, 0.0)
+def most_force(y, scale, radius, growth, drag, reach, is_soft, dof):
+    """What bounds the mean force of contacts, times Δt: the greatest force that growth may exert,
+    and those that the scaled moves y need, of all cells together, since a wall may bear them all.
+    Infinite where cells stick or walls are soft, since these push as well."""
+    held, moved, d = 0.0, 0.0, 2 if len(dof) == 4 else 3
     for w in range(is_soft.shape[0]):
         held = math.inf if is_soft[w] else held
     held = math.inf if max(reach[0], reach[1]) > 0 else held
-    for i in range(n):
-        deep = x[i, 2] / n if d == 3 else 0.0
-        centre = centre[0] + x[i, 0] / n, centre[1] + x[i, 1] / n, centre[2] + deep
-    for i in range(n):
+    for i in range(y.shape[0]):
         held = max(held, drag[1][i] * growth[i])
-        push, turn, away = 0.0, 0.0, 0.0
+        push, turn = 0.0, 0.0
         for k in range(degrees(dof) - 1):
             own = (y[i, k] / scale[i, k]) ** 2
             push += own if k < d else 0.0
             turn += 0.0 if k < d else own
-        for k in range(d):
-            away += (x[i, k] - centre[k]) ** 2
-        wide = 2.0 * radius[i]
-        moved += (math.sqrt(push) * (math.sqrt(away) + wide) + 2.0 * math.sqrt(turn)) / wide
-    return held, moved
+        moved += math.sqrt(push) + math.sqrt(turn) / radius[i]
+    return held + moved
 
 
 @lean
@@ -76,7 +69,7 @@ def following(e, rows, hardness, target, limits, most):
     """α at which the mean overlap of the contacts that push, all of them and those between cells,
     is at most `target`, µm, and that of the eighth powers the third of the limits: harder at once,
     softer by a factor of two a step. But no contacts are so hard that with their overlaps as they
-    are the mean force were beyond MOST_FORCE of what `most` bounds it by. Rows at the ends of
+    are the mean force were more than MOST_FORCE times `most`. Rows at the ends of
     stretches do not count."""
     total, count, peaks, between, pairs = 0.0, 0, 0.0, 0.0, 0
     softest, hardest, highest = limits
@@ -95,8 +88,7 @@ def following(e, rows, hardness, target, limits, most):
         overlap = max(total / count, between / max(pairs, 1))
         peak = math.sqrt(math.sqrt(math.sqrt(max(peaks / count, 1e-300))))
         if overlap > 0:
-            held, moved = most
             wanted = min(hardness * target / overlap, hardness / peak)
-            bound = MOST_FORCE * (held + moved / (pairs if pairs else count))
+            bound = MOST_FORCE * most
             wanted = min(max(wanted, overlap / bound) if bound > 0 else softest, softest)
     return max(min(wanted, 2.0 * hardness), hardest)

@@ -45,11 +45,10 @@ PEAK, PEAKED = 0.5, 4.0
 # Harder contacts are in vain where cells can neither move nor give way: as in a full chamber after
 # a division that leaves ends farther out, for cells give back SHRINK of their growth in a step.
 # Forces would be as large as contacts are hard. So contacts are only so hard that their mean force
-# is at most MOST_FORCE times what can make it. That is the greatest force that stops growth, γ Δl,
-# and, for what moves, the virial: Σ F (n · Δx) over all contacts is Σ f · x over all cells, with
-# the force f that moves a cell, and centres in contact are a width or more apart along the normal
-# n. In free growth and open channels this changes nothing. (In boxes 20 µm wide the force on the
-# walls was up to seven times that of the full box while they filled; so, it is below twice that.)
+# is at most MOST_FORCE times what can make it: the greatest force that stops growth, γ Δl, and the
+# forces that all moves need together, as a row of cells passes all of them on to a wall. In free
+# growth and open channels this changes nothing. (In boxes 20 µm wide the force on the walls was up
+# to seven times that of the full box while they filled; so, it is about twice that.)
 MOST_FORCE = 3.0
 # A pressed cell may lose this part of its growth in a step. Where a cell may lose none, overlaps in
 # closed chambers are twice as deep.

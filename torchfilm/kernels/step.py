@@ -245,7 +245,7 @@ def step_colony(memory, x, axis, length, growth, radius, drag, shortest, last, h
             break
         if error <= tolerance and number == 0 and not given:
             report[ALPHA] = before = kept_alpha if failed else hardness[0]  # of this solve
-            most = most_force(x, y, arrays[5], radius, growth, drag, reach, walls[3], dof)
+            most = most_force(y, arrays[5], radius, growth, drag, reach, walls[3], dof)
             hardness[0] = before if failed else following(e, rows, before, target, limits, most)
             if hardness[0] < LAG * before and not failed:  # the force has grown: solve again
                 put(y, kept)

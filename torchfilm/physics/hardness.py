@@ -49,15 +49,15 @@ class Limits:
 class Following:
     """α of the colonies of a pass that moves all cells.
 
-    hard: (R,) bool, the rows that count, those of `pairs` contacts between cells first. position:
-    (n, d) of the cells. wide: (n,) their widths, µm.
+    hard: (R,) bool, the rows that count, those of `pairs` contacts between cells first. radius:
+    (n,) of the cells, µm.
     """
 
     limits: Limits
     hard: Tensor
     pairs: int
-    position: Tensor
-    wide: Tensor
+    radius: Tensor
+    dim: int
 
     def alpha(self, hardness: Tensor, part: ContactProblem, y: Tensor, after: Tensor) -> Tensor:
         """α (B,) after a solve with α `hardness`, from its scaled moves y (n, D) and the gap of
@@ -80,8 +80,7 @@ class Following:
         for _ in range(3):
             peak = nearest_root(peak)
         wanted = torch.minimum(hardness * limits.target / mean, hardness / peak)
-        moved = self._needed(part, y) / torch.where(pairs > 0, pairs, several)
-        bound = MOST_FORCE * (limits.held + moved)
+        bound = MOST_FORCE * (limits.held + self._needed(part, y))
         some = bound > 0
         in_vain = mean / torch.where(some, bound, 1.0)
         wanted = torch.where(some, torch.maximum(wanted, in_vain), limits.softest)
@@ -89,11 +88,7 @@ class Following:
         return torch.maximum(torch.minimum(wanted, 2 * hardness), limits.hardest)
 
     def _needed(self, part: ContactProblem, y: Tensor) -> Tensor:
-        """The sum of the forces over all contacts that the moves y need, (B,)."""
-        dim, colonies = self.position.shape[1], part.colonies
+        """The forces that the moves of all cells need together, (B,)."""
         forces = y.double()[:, :-1] / part.scale.double()[:, :-1]
-        push, turn = safe_norm(forces[:, :dim].T), safe_norm(forces[:, dim:].T)
-        count = colonies.counts.clamp(min=1).unsqueeze(1)
-        centre = colonies.spread(colonies.sum(self.position) / count)
-        away = safe_norm((self.position - centre).T)
-        return colonies.sum((push * (away + self.wide) + 2.0 * turn) / self.wide)
+        push, turn = safe_norm(forces[:, : self.dim].T), safe_norm(forces[:, self.dim :].T)
+        return part.colonies.sum(push + turn / self.radius)

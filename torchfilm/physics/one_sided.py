@@ -215,7 +215,7 @@ class _OneStep:
             contacts = with_bonds(contacts, given.bonds, now)
             walls = with_wall_bonds(walls, given.bonds, now)
         follows = first_pass and given.alpha is None
-        following = self._following(at, contacts, walls, cells) if follows else None
+        following = self._following(contacts, walls, cells) if follows else None
         solved = self._solved(at, contacts, walls, moving, cells, active, least, number, following)
         part, end = solved.problem, solved.end
         y = self._with_gradient(part, end)
@@ -246,13 +246,12 @@ class _OneStep:
         moving = moving & self.of_cells(sound).bool()
         return self._moved(at, move, about, moving, least, number)
 
-    def _following(self, at, contacts, walls, cells) -> Following:
+    def _following(self, contacts, walls, cells) -> Following:
         """What α follows in a first pass, which moves all cells."""
         root, soft = self._wall_roots(walls, torch.ones_like(self.given.radius))
         hard = torch.cat([~contacts.beside, ~soft & (root >= 1)])
-        place, wide = at.position.double(), 2.0 * self.given.radius.double()
-        of = lambda x: x.index_select(0, cells)
-        return Following(self.limits, hard, len(contacts.gap), of(place), of(wide))
+        radius = self.given.radius.double().index_select(0, cells)
+        return Following(self.limits, hard, len(contacts.gap), radius, self.dim)
 
     def _solved(
         self, at, contacts, walls, moving, cells, active, least, number, following
