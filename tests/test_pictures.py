@@ -477,13 +477,15 @@ def test_each_colonys_own_walls_are_drawn(tmp_path):
 
 
 def test_colonies_of_a_study_are_named_by_the_parameter_that_differs(tmp_path):
-    """But not where several differ."""
-    founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]])
-    for name, noise, titles in (
-        ("one.h5", 0.001, ["rate = 0.5: 1 cell", "rate = 1.25: 1 cell"]),
-        ("two.h5", [0.0, 0.1], ["colony 0: 1 cell", "colony 1: 1 cell"]),
-    ):
-        division = tf.Division(length=9.0, axis_noise=noise)
+    """Or by two of them, but not by more."""
+    founders, of_two = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]]), ("axis_noise = 0", "axis_noise = 0.1")
+    for name, length, noise, titles in (
+        ("one.h5", 9.0, 0.001, ["rate = 0.5: 1 cell", "rate = 1.25: 1 cell"]),
+        ("two.h5", 9.0, [0.0, 0.1],
+         [f"{of_two[0]}, rate = 0.5: 1 cell", f"{of_two[1]}, rate = 1.25: 1 cell"]),
+        ("three.h5", [9.0, 8.0], [0.0, 0.1], ["colony 0: 1 cell", "colony 1: 1 cell"]),
+    ):  # fmt: skip
+        division = tf.Division(length=length, axis_noise=noise)
         scene = tf.Scene(tf.Growth(rate=[0.5, 1.25]), division, founders=founders)
         for _ in tf.simulate(scene, until=0.1, record=tmp_path / name):
             pass
