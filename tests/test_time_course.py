@@ -238,6 +238,18 @@ def test_means_of_numbers_count_those_that_died_and_not_those_that_failed(replic
     assert set(marks) == {(died, 0.0), (failed, 1.0)}
 
 
+def test_colonies_without_a_type_count_as_0(replicated):
+    """Of six colonies, one begins with a cell of type 1; none but one has any."""
+    options = {"by": "cell_type", "conditions": "iptg"}
+    ax = tf.pictures.time_course(replicated, **options).figure.axes[0]
+    mean = {x.get_label(): x.get_ydata() for x in ax.lines if "mean" in x.get_label()}
+    assert mean["iptg = 0.1, cell_type 1, mean of 6"][0] == pytest.approx(1 / 6)
+    assert mean["iptg = 0.1, cell_type 0, mean of 6"][0] == pytest.approx(4 / 6)
+    assert mean["iptg = 2, cell_type 1, mean of 6"].max() == 0.0
+    one = tf.pictures.time_course(replicated, **options, most=1).figure
+    assert "first 1 of 2 conditions" in one.get_suptitle()
+
+
 def test_many_replicates_are_a_band(replicated):
     every = {k: "all" for k in range(12)}
     ax, length = tf.pictures.time_course(replicated, "length", conditions=every).figure.axes

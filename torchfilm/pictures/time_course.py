@@ -50,8 +50,8 @@ def time_course(
     """Draw the number of cells of each colony against time, and below it each quantity: the mean
     over its cells, of up to four lines also the band from 10 to 90 % of them. Colonies of one
     condition are replicates: thin lines of one colour beside their mean, or if they are more than
-    ten, the band from 10 to 90 % of them. A mean of numbers of cells counts those that have died
-    out as 0; other means are of colonies that have cells.
+    ten, the band from 10 to 90 % of them. A mean of numbers of cells counts those without as 0;
+    other means are of colonies that have cells.
 
     what: a results file, or its path. quantities: fields of the cells, "volume", "age" or "born",
     signals at them as "out.NAME", or "biovolume", µm³, of all cells of a colony. by: a field of
@@ -73,7 +73,8 @@ def time_course(
             raise checks.InputError(f"a time course needs two frames, and {results.path} has one")
         frames, times = RecordedFrames(results, range(len(results))), results.times
         names = condition_names(results, conditions)
-        places, more = _places(frames, names, colonies, most if by is None else len(STYLES))
+        most = most if by is None else min(checks.integer("most", most, least=1), len(STYLES))
+        places, more = _places(frames, names, colonies, most)
         each = known_quantities(results, *(VOLUME if q == BIOVOLUME else q for q in quantities),
                                 by=by)  # fmt: skip
         found = [_seen(cells, known, places, by, quantities) for cells, known in each]
@@ -82,13 +83,13 @@ def time_course(
         none = np.full((1 + len(quantities), 3), np.nan)
         seen = np.stack([[one.get((x.place, x.kind), none) for x in lines] for one in found])
         seen[:, :, 0][seen[:, :, 0] == 0] = np.nan
-        failed = _failed(results, seen[-1, :, 0, 0], lines)
+        failed = _failed(results, lines)
         figure = new_figure(WIDE, HIGH * (1 + len(quantities)) + 0.3, dpi)
         axes = list(figure.subplots(1 + len(quantities), 1, sharex=True, squeeze=False)[:, 0])
         labels = list(dict.fromkeys(x.label for x in lines))
         for label in labels:
             same = np.array([k for k, x in enumerate(lines) if x.label == label])
-            _draw_alike(axes, times, seen[:, same], [lines[k] for k in same], failed[same],
+            _draw_alike(axes, times, seen[:, same], [lines[k] for k in same], failed[:, same],
                         band=len(lines) <= FEW, sums=_sums(quantities))  # fmt: skip
         _finish_all(axes, results, quantities, seen, log)
         axes[-1].set_xlabel("time (h)")
@@ -141,17 +142,17 @@ def _draw_alike(
     failed: np.ndarray, *, band: bool, sums: Sequence[int],
 ) -> None:  # fmt: skip
     """Draw the lines of one condition, (frames, lines, panels, 3), and their mean if they are
-    several. failed: (lines,) whose colony has failed."""
+    several. failed: (frames, lines) where the colony has failed."""
     several, many = len(lines) > 1, len(lines) > MANY
     for k, line in enumerate(lines if not many else ()):
         _draw(axes, times, seen[:, k], line, band and not several, several)
-        _draw_end(axes[0], times, seen[:, k, 0, 0], line, several, bool(failed[k]))
+        _draw_end(axes[0], times, seen[:, k, 0, 0], line, several, failed[:, k])
     if not several:
         return
     filled = seen.copy()
-    for panel in sums:  # those that have died out count
-        gone = _gone(seen[:, :, 0, 0]) & ~failed
-        filled[:, :, panel][gone] = 0.0
+    none = np.isnan(seen[:, :, 0, 0]) & ~failed
+    for panel in sums:  # those without cells count, whether dead or of other kinds
+        filled[:, :, panel][none] = 0.0
     mean = _mean(filled)
     if many:
         with warnings.catch_warnings():
@@ -178,15 +179,19 @@ def _draw(
 
 
 def _draw_end(
-    ax: Axes, times: np.ndarray, counts: np.ndarray, line: CourseLine, thin: bool, failed: bool
+    ax: Axes,
+    times: np.ndarray,
+    counts: np.ndarray,
+    line: CourseLine,
+    thin: bool,
+    failed: np.ndarray,
 ) -> None:
     """Mark where the cells of a line die out, and draw that there are 0 from then on; or where its
-    colony fails. counts: of each frame; NaN without cells."""
-    gone, size = _gone(counts), 12 if thin else 30
-    if failed:
-        last = np.flatnonzero(~np.isnan(counts))[-1:]
+    colony fails. counts: of each frame; NaN without cells. failed: (frames,) where it has."""
+    gone, size = _gone(counts) & ~failed, 12 if thin else 30
+    last = np.flatnonzero(~failed)[-1:]
+    if failed.any() and counts[last] > 0:
         ax.scatter(times[last], counts[last], s=size, color=line.colour, marker="x", zorder=3)
-        return
     change = np.diff(gone.astype(int), prepend=0, append=0)
     begin, end = np.flatnonzero(change == 1), np.flatnonzero(change == -1) - 1
     zero, lw = np.zeros(len(begin)), 0.5 if thin else 1.2
@@ -194,14 +199,16 @@ def _draw_end(
     ax.scatter(times[begin], zero, s=size, color=line.colour, marker="v", zorder=3)
 
 
-def _failed(results: Results, last: np.ndarray, lines: Sequence[CourseLine]) -> np.ndarray:
-    """(lines,) of which colonies the run was stopped by an error. last: numbers of cells in the
-    last frame, NaN for none."""
-    if not np.isnan(last).any():
-        return np.zeros(len(lines), bool)
+def _failed(results: Results, lines: Sequence[CourseLine]) -> np.ndarray:
+    """(frames, lines) where the colony of a line has failed before."""
+    places = [x.place for x in lines]
+    counts = results.counts[:, places]
+    if counts[-1].all():
+        return np.zeros(counts.shape, bool)
     tree = results.lineage()
-    failed = np.unique(tree.colony[tree.fate == "failed"])
-    return np.isin(results.colony_id[[x.place for x in lines]], failed)
+    failed = np.isin(results.colony_id[places], tree.colony[tree.fate == "failed"])
+    living = np.logical_or.accumulate(counts[::-1] > 0)[::-1]  # then or later
+    return failed & ~living
 
 
 def _gone(counts: np.ndarray) -> np.ndarray:
