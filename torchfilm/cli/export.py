@@ -18,9 +18,9 @@ from torchfilm.tools.checks import InputError
 from torchfilm.tools.whole_files import write_whole, written_whole
 
 TABLE, NEWICK, GRAPH, VTK = ".csv", ".nwk", ".graphml", ".vtkhdf"
-LIVES = ".lineage.csv"
+LIVES, COLONIES = ".lineage.csv", ".colonies.csv"
 IMAGES = (".tif", ".tiff")
-SUFFIXES = (TABLE, LIVES, NEWICK, GRAPH, VTK, *IMAGES)
+SUFFIXES = (TABLE, LIVES, COLONIES, NEWICK, GRAPH, VTK, *IMAGES)
 FOLDER = ""  # ground truth for segmentation and tracking is a folder, which has no suffix
 # Options of each format, beside --overwrite.
 PAGES = ("frames", "colonies", "pixel_size", "window")
@@ -28,6 +28,7 @@ LIGHT = ("channels", "blur", "noise", "background", "offset", "profile", "seed")
 OPTIONS: dict[str, tuple[str, ...]] = {
     TABLE: ("frames", "internals"),
     LIVES: (),
+    COLONIES: ("frames", "internals"),
     NEWICK: ("colonies",),
     GRAPH: ("colonies",),
     VTK: ("frames", "colonies", "rods"),
@@ -40,8 +41,9 @@ OPTIONS: dict[str, tuple[str, ...]] = {
 @dataclass
 class Export:
     """Write results for other programs. The suffix of the new file says the format: .csv, the
-    table of cells, frame by frame; .lineage.csv, one row per cell: when it was born and ended, how
-    long it was then, and its fate; .vtkhdf, for ParaView and pyvista; .tif or .ome.tif, label
+    table of cells, frame by frame; .colonies.csv, one row per colony and frame: its cells, deaths
+    and means; .lineage.csv, one row per cell: when it was born and ended, how long it was then, and
+    its fate; .vtkhdf, for ParaView and pyvista; .tif or .ome.tif, label
     masks, or fluorescence where --channels are given; .nwk, the lineage in Newick format; .graphml,
     the lineage as a graph. A name without a dot, such as ctc/, is a folder in the format of the
     Cell Tracking Challenge: images, label masks and tracks."""
@@ -49,14 +51,14 @@ class Export:
     file: Annotated[Path, tyro.conf.Positional]
     """Results file."""
     out: Annotated[Path, tyro.conf.Positional]
-    """The new file: NAME.csv, .lineage.csv, .vtkhdf, .tif, .ome.tif, .nwk or .graphml; or the new
-    folder."""
+    """The new file: NAME.csv, .colonies.csv, .lineage.csv, .vtkhdf, .tif, .ome.tif, .nwk or
+    .graphml; or the new folder."""
     frames: list[str] = field(default_factory=list)
     """Which frames, such as --frames 0 10 -1, or ranges START:STOP or START:STOP:STEP as in Python,
     such as --frames 2:5 or --frames=-3:; by default all. (Not .lineage.csv, .nwk, .graphml.)"""
     colonies: list[int] = field(default_factory=list)
     """Which colonies, by their ids; by default all. Images need one, if the run has several; .nwk
-    and .graphml take one or all. (Not .csv, .lineage.csv.)"""
+    and .graphml take one or all. (Not for tables.)"""
     pixel_size: float | None = None
     """Images: width of a pixel, µm."""
     window: list[float] = field(default_factory=list)
@@ -84,7 +86,7 @@ class Export:
     rods: str | None = None
     """.vtkhdf: capsules (the default), or lines, which take less space."""
     internals: bool = False
-    """.csv: with the fields that serve the numerics."""
+    """.csv, .colonies.csv: with the fields that serve the numerics."""
     overwrite: bool = False
     """Replace the file or the folder if it exists."""
 
@@ -93,13 +95,15 @@ class Export:
         if suffix not in (*SUFFIXES, FOLDER):
             rule = f"a name that ends in {', '.join(SUFFIXES)}, or that of a folder, without a dot"
             raise checks.input_error("OUT", str(self.out), rule)
-        form = LIVES if self.out.name.lower().endswith(LIVES) else suffix
+        name = self.out.name.lower()
+        form = next((own for own in (LIVES, COLONIES) if name.endswith(own)), suffix)
         if suffix in IMAGES:
             form = "fluorescence" if self.channels else "label masks"
         self._check_options(form)
         writers: dict[str, Callable[[Results], Any]] = {
             TABLE: self._table,
             LIVES: self._lives,
+            COLONIES: self._colonies,
             NEWICK: self._newick,
             GRAPH: self._graph,
             VTK: self._vtk,
@@ -163,7 +167,15 @@ class Export:
         return [path]
 
     def _lives(self, results: Results) -> list[Path]:
-        path, table = self._new(results, TABLE), results.lineage().to_pandas()
+        return self._whole_table(results, results.lineage().to_pandas())
+
+    def _colonies(self, results: Results) -> list[Path]:
+        frames, internals = self._frames(results), self.internals
+        table = results.to_pandas(frames, each="colony", internals=internals)
+        return self._whole_table(results, table)
+
+    def _whole_table(self, results: Results, table: Any) -> list[Path]:
+        path = self._new(results, TABLE)
         with written_whole(path) as beside:
             table.to_csv(beside, index=False)
         return [path]
@@ -256,7 +268,7 @@ def _gain(text: str) -> tuple[str, float]:
 
 
 def _content(form: str) -> str:
-    known = {TABLE: "the table", VTK: "shapes"} | dict.fromkeys(
+    known = {TABLE: "the table", COLONIES: "the table of colonies", VTK: "shapes"} | dict.fromkeys(
         (LIVES, NEWICK, GRAPH), "the lineage"
     )
     return {**known, FOLDER: "images, label masks and tracks"}.get(form, form)

@@ -7,31 +7,23 @@ import operator
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from types import EllipsisType
 from typing import Any
 
-import h5py
 import numpy as np
 import torch
 
 from torchfilm.initial_cells import Cells
 from torchfilm.io.blocks import spans
 from torchfilm.io.card import card
-from torchfilm.io.identity import check_same_scene, declared_fields
-from torchfilm.io.layout import AT_CELLS, INTERNAL_BEFORE, INTERNAL_ENDING_BEFORE
+from torchfilm.io.colony_table import colony_table
+from torchfilm.io.identity import check_same_scene
+from torchfilm.io.layout import AT_CELLS
 from torchfilm.io.lineage import Lineage
 from torchfilm.io.new_file import check_frames
 from torchfilm.io.parameters import parameters_at
-from torchfilm.io.reading import (
-    dataset_names,
-    frame_count,
-    inode_of_open,
-    open_results,
-    read_attribute,
-    read_dataset,
-    refresh,
-)
+from torchfilm.io.reading import frame_count, inode_of_open, open_results, refresh
 from torchfilm.io.restoring import cells_of, restore_state
+from torchfilm.io.results_file import ResultsFile
 from torchfilm.io.table import Tables, data_frame
 from torchfilm.scene import Scene
 from torchfilm.state import State
@@ -43,35 +35,10 @@ BY_NUMBER = {
 }
 
 
-class Results(metaclass=checks.KnownKeywords):
+class Results(ResultsFile):
     """A results file to read: `len(results)` frames; `results.frame(k)`, `results.table(k)`,
     `results.lineage()`, `results.state(scene, k)`. Raises InputError if the file is not a readable
     results file."""
-
-    def __init__(self, path: str | Path):
-        self.path = checks.file_path("path", path)
-        self._place = self.path.resolve()  # the path may be relative to a folder that is left
-        self._open = open_results(self.path)
-
-    @property
-    def file(self) -> h5py.File:
-        """The HDF5 file. Raises InputError where it is closed."""
-        if not self._open:
-            raise InputError(f"{self.path} is closed: read inside `with tf.Results(…) as results:`")
-        return self._open
-
-    def __enter__(self) -> Results:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file, as leaving `with` does; again does nothing."""
-        self._open.close()
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self._place,)  # another process opens the file itself
 
     def __len__(self) -> int:
         return frame_count(self.file)
@@ -86,12 +53,6 @@ class Results(metaclass=checks.KnownKeywords):
 
     def _repr_html_(self) -> str:
         return card(self, self._names("cells")) if self._open else displays.card(repr(self))
-
-    def _read(self, name: str, at: int | slice | EllipsisType = ...) -> Any:
-        return read_dataset(self.file, name, at)
-
-    def _names(self, group: str) -> tuple[str, ...]:
-        return dataset_names(self.file, group)
 
     @property
     def times(self) -> np.ndarray:
@@ -117,55 +78,6 @@ class Results(metaclass=checks.KnownKeywords):
     def stream(self) -> np.ndarray:
         """(B,) the stream of random numbers that each colony uses."""
         return self._read("stream" if "stream" in self.file else "colony_id")
-
-    @property
-    def attributes(self) -> dict[str, Any]:
-        """Scene, recipe, seed, versions, …"""
-        return dict(self.file.attrs)
-
-    @property
-    def recipe(self) -> tuple[str, dict[str, Any]] | None:
-        """Name and parameters of the ready-made scene; None for a scene of the user's own."""
-        found = read_attribute(self.file, "recipe")
-        return None if found is None else (found[0], found[1])
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The parameters given to a scene function of the user's own."""
-        return read_attribute(self.file, "settings", "{}")
-
-    @property
-    def accuracy(self) -> dict[str, float]:
-        """The knobs of accuracy given to the scene beside its own (`torchfilm.Settings`)."""
-        return read_attribute(self.file, "accuracy", "{}")
-
-    @property
-    def walls(self) -> list[dict[str, Any]]:
-        """The surfaces that cells could not pass. A flat one has "normal" and "offset" (normal · x
-        on it, µm), a round one "centre" and "radius", µm. Each entry is one number, or a list of
-        one per colony. "soft" says whether the surface yields."""
-        found = read_attribute(self.file, "walls", "[]")  # of earlier versions with "center"
-        return [{n.replace("center", "centre"): x for n, x in wall.items()} for wall in found]
-
-    @property
-    def periodic(self) -> dict[str, tuple[float, float]]:
-        """The faces of axes along which space is periodic for cells, (low, high) µm."""
-        found = read_attribute(self.file, "periodic", "{}")
-        return {axis: (low, high) for axis, (low, high) in found.items()}
-
-    @property
-    def type_names(self) -> list[str]:
-        """The names of the cells' types 0, 1, …, as far as the scene gave them some."""
-        return read_attribute(self.file, "type_names", "[]")
-
-    @property
-    def internal_fields(self) -> set[str]:
-        """The fields that serve the numerics: `table` shows them only with `internals`."""
-        given = self.file.attrs.get("internal")
-        if given is not None:
-            return set(read_attribute(self.file, "internal"))
-        names = declared_fields(self.file.attrs)
-        return {n for n in names if n in INTERNAL_BEFORE or n.endswith(INTERNAL_ENDING_BEFORE)}
 
     def refresh(self) -> None:
         """Read what a run has written since. If another file has replaced this one (a resumed run,
@@ -270,7 +182,11 @@ class Results(metaclass=checks.KnownKeywords):
 
     @partial(checks.known_keywords, instead=BY_NUMBER)
     def table(
-        self, frame: int | Sequence[int] | None = None, *, internals: bool = False
+        self,
+        frame: int | Sequence[int] | None = None,
+        *,
+        each: str = "cell",
+        internals: bool = False,
     ) -> dict[str, np.ndarray]:
         """One row per cell, one column per quantity: of one frame, of several, or of all.
 
@@ -281,18 +197,30 @@ class Results(metaclass=checks.KnownKeywords):
         parameters with one value per colony, by the shortest name that is free. A field whose name
         is one of those above is called field.NAME. internals: with the axis, and with the fields
         that serve the numerics.
+
+        each="colony": one row per colony, also where it has no cells: frame · time · colony · cells
+        · biovolume, µm³, of all its cells · cells.NAME, cells of each type · how many of its cells
+        had divided, lysed, … until then, of each fate that occurs · mean.NAME, over its cells, NaN
+        without any · the fields of colonies · the parameters.
         """
+        checks.choice("each", each, ("cell", "colony"))
         several = frame is None or isinstance(frame, (list, tuple, range, np.ndarray))
         whole = lambda: check_frames(len(self), frame, self.path, "frame")
         frames = whole() if several else [self._index(frame)]
+        if each == "colony":
+            return colony_table(self, frames, internals)
         return Tables(self, self.lineage(), internals)(frames)
 
     @partial(checks.known_keywords, instead=BY_NUMBER)
     def to_pandas(
-        self, frame: int | Sequence[int] | None = None, *, internals: bool = False
+        self,
+        frame: int | Sequence[int] | None = None,
+        *,
+        each: str = "cell",
+        internals: bool = False,
     ) -> Any:
         """`table` as a pandas.DataFrame. Requires the extra `tables`."""
-        return data_frame(self.table(frame, internals=internals))
+        return data_frame(self.table(frame, each=each, internals=internals))
 
     def lineage(self) -> Lineage:
         """Every cell that ever lived, as arrays and as a tree."""

@@ -59,6 +59,19 @@ class Tables:
 
     def _columns(self, block: Block, keep: Keep | None) -> dict[str, np.ndarray]:
         """The columns of frames in which the parameters of colonies are the same."""
+        columns, place = self.of_cells(block, keep)
+        values = self.parameters(block, columns)
+        return columns | {name: x[place] for name, x in values.items()}
+
+    @property
+    def hidden(self) -> set[str]:
+        """The fields that are not shown."""
+        return set() if self.internals else self.results.internal_fields
+
+    def of_cells(
+        self, block: Block, keep: Keep | None = None
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """The columns without parameters, and the place of each cell's colony, (N,)."""
         results = self.results
         found, signals, which = block.cells(), block.signals(), block.which
         of_colonies = block.colony_fields(found["colony"])
@@ -78,13 +91,15 @@ class Tables:
             "age": time - born,
             "born": born,
         }
-        fields = found | of_colonies
-        hidden = set() if self.internals else results.internal_fields
-        columns |= _of_fields({n: x for n, x in fields.items() if n not in hidden}, signals)
-        values = results.parameters(block.frames[0])
-        for path, name in column_names(list(values), set(columns)).items():
-            columns[name] = values[path][place]
-        return columns
+        fields = {n: x for n, x in (found | of_colonies).items() if n not in self.hidden}
+        return columns | of_fields(fields, signals), place
+
+    def parameters(self, block: Block, columns: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """The parameters with one value per colony, (B,), by the shortest names that the `columns`
+        leave free."""
+        values = self.results.parameters(block.frames[0])
+        names = column_names(list(values), set(columns))
+        return {name: values[path] for path, name in names.items()}
 
 
 @checks.known_keywords
@@ -108,7 +123,7 @@ def cell_table(state: State, *, internals: bool = False) -> dict[str, np.ndarray
     contact = state.contact()
     signals = {} if contact is None else {n: on_cpu(x) for n, x in contact.found.items()}
     columns = {n: on_cpu(x) for n, x in found.items()}
-    return _of_cells(state.time, columns, internals) | _of_fields(columns, signals)
+    return _of_cells(state.time, columns, internals) | of_fields(columns, signals)
 
 
 def _of_cells(
@@ -127,7 +142,7 @@ def _of_cells(
     }
 
 
-def _of_fields(
+def of_fields(
     fields: Mapping[str, np.ndarray], signals: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """The columns of fields, and of the signals at the cells."""
