@@ -305,3 +305,47 @@ def test_types_have_the_colours_of_pictures(tmp_path):
     drawn = tf.pictures.time_course(path, by="cell_type").figure.axes[0].lines
     colours = [matplotlib.colors.to_hex(line.get_color()).upper() for line in drawn]
     assert colours == [KINDS[0], KINDS[2]]
+
+
+def test_several_runs_in_one_picture(tmp_path):
+    def run(name, rate, until, colonies=3):
+        scene = tf.Scene(
+            tf.Growth(rate=1.0), tf.Division(length=tf.LogNormal(3.0, 0.1)), tf.Lysis(rate=rate),
+            founders=tf.Cells([[0.0, 0.0], [6.0, 0.0]], [1.0, 0.0], cell_type=[0, 1]),
+            dt=0.1, name=name,
+        )  # fmt: skip
+        path = tmp_path / f"{name}.h5"
+        record = tf.Recorder(path, scene, every=2)
+        tf.simulate(scene, until=until, colonies=colonies, seed=1, record=record).last()
+        return path
+
+    dead, long = run("dead", 50.0, 1.0), run("long", 0.0, 2.0)
+    doses = run("doses", torch.tensor([0.0, 9.0, 9.0]), 1.0)
+    picture = tf.pictures.time_course({"with": dead, "without": long}, "length")
+    ax, length = picture.figure.axes
+    assert [t.get_text() for t in ax.get_legend().texts] == [
+        "with, mean of 3", "without, mean of 3",
+    ]  # fmt: skip
+    with tf.Results(long) as results:
+        mean, times = results.counts.mean(1), results.times
+        both = tf.pictures.time_course({"a": results, "b": results}, most=1).figure.axes[0]
+        assert results.times[-1] == 2.0  # it stays open
+    assert len({line.get_color() for line in both.lines}) == 2
+    lines = ax.lines
+    assert len(lines) == 2 * (3 + 1) and lines[7].get_xdata().tolist() == times.tolist()
+    np.testing.assert_allclose(lines[7].get_ydata(), mean)
+    assert lines[3].get_xdata()[-1] == 1.0 and lines[3].get_ydata()[-1] == 0.0
+    assert length.get_xlim() == pytest.approx((-0.1, 2.1))
+    assert length.get_ylabel() == "mean of length (µm)"
+    assert picture.figure.get_suptitle() == "dead, long"
+    named = tf.pictures.time_course({"lysis": doses, "none": long}).figure.axes[0].get_legend()
+    assert [t.get_text() for t in named.texts] == [
+        "lysis, rate = 0", "lysis, rate = 9, mean of 2", "none, mean of 3",
+    ]  # fmt: skip
+    split = tf.pictures.time_course({"lysis": dead, "none": long}, by="cell_type").figure.axes[0]
+    assert {line.get_linestyle() for line in split.lines} == {"-", "--"}
+    for wrong in ([dead], {}, {"": dead}, {1: dead}):
+        with pytest.raises(tf.InputError, match="files by the names of runs"):
+            tf.pictures.time_course(wrong)
+    with pytest.raises(tf.InputError, match="another file than the results"):
+        tf.pictures.time_course({"a": dead, "b": long}, out=long)

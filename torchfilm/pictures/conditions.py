@@ -42,18 +42,22 @@ def _words(values: np.ndarray) -> list[str]:
 
 
 def condition_names(
-    results: Results, conditions: str | Sequence[str] | Mapping[int, str] | None
+    results: Results, conditions: str | Sequence[str] | Mapping[int, str] | None, run: str = ""
 ) -> dict[int, str]:
     """The condition of each colony that has one, by its place in the file: see `time_course`. By
     default the parameters that differ at the end of the run, or if none does at its beginning; and
-    else the colony's id."""
+    else the colony's id. run: the name of one of several runs, with which those of its conditions
+    begin; without such parameters the colonies of a run are replicates."""
+    if run:
+        if conditions is None and _by_parameters(results) is None:
+            return dict.fromkeys(range(len(results.colony_id)), run)
+        return {k: f"{run}, {name}" for k, name in condition_names(results, conditions).items()}
     ids = results.colony_id.tolist()
     if isinstance(conditions, Mapping):
         return _own_names(conditions, ids)
-    last, first = results.parameters(-1), results.parameters(0)
     if conditions is None:
-        found = names_by_parameters(last) or names_by_parameters(first)
-        return dict(enumerate(found or [f"colony {k}" for k in ids]))
+        return dict(enumerate(_by_parameters(results) or [f"colony {k}" for k in ids]))
+    last = results.parameters(-1)
     wanted = [conditions] if isinstance(conditions, str) else conditions
     rule = "a parameter that has one value per colony, several of them, or {0: 'control', …}"
     if not isinstance(wanted, Sequence) or not wanted:
@@ -68,6 +72,12 @@ def condition_names(
             raise checks.input_error("conditions", name, have, hint)
         columns[names[known[name]]] = last[known[name]]
     return dict(enumerate(_joined(columns)))
+
+
+def _by_parameters(results: Results) -> list[str] | None:
+    """Colonies named by the parameters that differ at the end of the run, or at its beginning."""
+    found = names_by_parameters(results.parameters(-1))
+    return found or names_by_parameters(results.parameters(0))
 
 
 def _own_names(given: Mapping[Any, Any], ids: Sequence[int]) -> dict[int, str]:

@@ -13,31 +13,26 @@ import numpy as np
 from torchfilm.io.results import Results
 from torchfilm.pictures.categories import KINDS, colours_of_kinds
 from torchfilm.pictures.colours import TYPES
-from torchfilm.pictures.conditions import condition_names
-from torchfilm.pictures.figures import check_not_results, choose_colonies, opened
-from torchfilm.pictures.frames import VOLUME, RecordedFrames
+from torchfilm.pictures.figures import check_not_results, opened
 from torchfilm.pictures.page import checked_dpi
 from torchfilm.pictures.picture import Picture, new_figure
-from torchfilm.pictures.place_and_time import Columns, known_quantities, unit_at_cells
+from torchfilm.pictures.run_courses import ALL, BAND, BIOVOLUME, RunCourse, run_course
 from torchfilm.tools import checks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WIDE, HIGH = 5.0, 2.2  # inches, of a panel
-BIOVOLUME = "biovolume"
 MANY = 10  # replicates, beyond which a band shows them
 TALL = 12  # names in a column of the legend
 FEW = 4  # colonies up to which a band shows the spread between cells
-BAND = (10.0, 90.0)  # percentiles
 TENFOLD = 10.0  # numbers of cells of such a range are drawn by their logarithms
-ALL = -1  # the kind of cells that are not told apart
 STYLES = ("-", "--", ":", "-.")  # of colonies, where colours are those of kinds
 
 
 @checks.known_keywords
 def time_course(
-    what: str | Path | Results,
+    what: str | Path | Results | Mapping[str, str | Path | Results],
     *quantities: str,
     by: str | None = None,
     conditions: str | Sequence[str] | Mapping[int, str] | None = None,
@@ -53,52 +48,54 @@ def time_course(
     ten, the band from 10 to 90 % of them. A mean of numbers of cells counts those without as 0;
     other means are of colonies that have cells.
 
-    what: a results file, or its path. quantities: fields of the cells, "volume", "age" or "born",
-    signals at them as "out.NAME", or "biovolume", µm³, of all cells of a colony. by: a field of
-    whole numbers, such as "cell_type": cells of each are counted apart, a colour for each, and a
-    style of lines for each of up to four conditions. conditions: a parameter that has one value per
-    colony, as tables name it, or several: colonies in which these are the same are of one
-    condition; or names by id, {0: "control", 1: "control", 2: "starved"}. By default all
-    parameters count, where up to two differ. colonies: their ids; default those of the first `most`
-    conditions that had cells. log: logarithmic axes of the quantities; the number of cells has one
-    where it grows more than tenfold. Where all cells of a line have died, a triangle at 0 marks
-    when; a logarithmic axis then has a 0 below 1. A cross marks where a colony has failed. out:
-    save the picture there. Raises InputError for a quantity that is not recorded, and for a file of
-    one frame."""
-    with opened(what) as results:
-        check_not_results(results.path, out)
-        checked_dpi(dpi)
-        checks.choice("log", log, (True, False))
-        if len(results) < 2:
-            raise checks.InputError(f"a time course needs two frames, and {results.path} has one")
-        frames, times = RecordedFrames(results, range(len(results))), results.times
-        names = condition_names(results, conditions)
-        most = most if by is None else min(checks.integer("most", most, least=1), len(STYLES))
-        places, more = _places(frames, names, colonies, most)
-        each = known_quantities(results, *(VOLUME if q == BIOVOLUME else q for q in quantities),
-                                by=by)  # fmt: skip
-        found = [_seen(cells, known, places, by, quantities) for cells, known in each]
-        kinds = sorted({kind for one in found for _, kind in one})
-        lines = _lines({p: names[p] for p in places}, kinds, by, frames)
-        none = np.full((1 + len(quantities), 3), np.nan)
-        seen = np.stack([[one.get((x.place, x.kind), none) for x in lines] for one in found])
-        seen[:, :, 0][seen[:, :, 0] == 0] = np.nan
-        failed = _failed(results, lines)
-        figure = new_figure(WIDE, HIGH * (1 + len(quantities)) + 0.3, dpi)
-        axes = list(figure.subplots(1 + len(quantities), 1, sharex=True, squeeze=False)[:, 0])
-        labels = list(dict.fromkeys(x.label for x in lines))
-        for label in labels:
-            same = np.array([k for k, x in enumerate(lines) if x.label == label])
-            _draw_alike(axes, times, seen[:, same], [lines[k] for k in same], failed[:, same],
-                        band=len(lines) <= FEW, sums=_sums(quantities))  # fmt: skip
-        _finish_all(axes, results, quantities, seen, log)
-        axes[-1].set_xlabel("time (h)")
-        ends = times[[0, -1]]  # of the run, also where its last cell died before
-        axes[-1].set_xlim(*(ends + 0.05 * np.diff(ends) * [-1, 1]))
-        if len(results.colony_id) > 1 or by is not None:
-            _legend(axes[0])
-        figure.suptitle(f"{frames.title}{more}", fontsize=9, parse_math=False)
-        return Picture(figure, out)
+    what: a results file, or its path; or several runs by name, {"drug": "drug.h5", "control":
+    "control.h5"}, whose colonies are replicates unless their parameters differ. quantities: fields
+    of the cells, "volume", "age" or "born", signals at them as "out.NAME", or "biovolume", µm³, of
+    all cells of a colony. by: a field of whole numbers, such as "cell_type": cells of each are
+    counted apart, a colour for each, and a style of lines for each of up to four conditions.
+    conditions: a parameter that has one value per colony, as tables name it, or several: colonies
+    in which these are the same are of one condition; or names by id, {0: "control", 1: "control",
+    2: "starved"}. By default all parameters count, where up to two differ. colonies: their ids;
+    default those of the first `most` conditions that had cells. log: logarithmic axes of the
+    quantities; the number of cells has one where it grows more than tenfold. Where all cells of a
+    line have died, a triangle at 0 marks when; a logarithmic axis then has a 0 below 1. A cross
+    marks where a colony has failed. out: save the picture there. Raises InputError for a quantity
+    that is not recorded, and for a file of one frame."""
+    checked_dpi(dpi)
+    checks.choice("log", log, (True, False))
+    checks.integer("most", most, least=1)
+    runs = _runs(what)
+    if by is not None:
+        most = min(most, max(1, len(STYLES) // len(runs)))
+    courses = []
+    for name, one in runs.items():
+        with opened(one) as results:
+            check_not_results(results.path, out)
+            courses.append(run_course(results, name, quantities, by, conditions, colonies, most))
+    lines = _lines(courses, by)
+    figure = new_figure(WIDE, HIGH * (1 + len(quantities)) + 0.3, dpi)
+    axes = list(figure.subplots(1 + len(quantities), 1, sharex=True, squeeze=False)[:, 0])
+    seen = _draw_runs(axes, courses, lines, _sums(quantities))
+    _finish_all(axes, courses, quantities, seen, log)
+    if len(runs) > 1 or courses[0].several or by is not None:
+        _legend(axes[0])
+    titles = ", ".join(dict.fromkeys(x.title for x in courses))
+    figure.suptitle(titles, fontsize=9, parse_math=False)
+    return Picture(figure, out)
+
+
+def _runs(what: Any) -> Mapping[str, Any]:
+    """The files by their names; "" for one alone."""
+    if not isinstance(what, Mapping | list | tuple):
+        return {"": what}
+    if (
+        not isinstance(what, Mapping)
+        or not what
+        or not all(isinstance(name, str) and name for name in what)
+    ):
+        rule = 'files by the names of runs, such as {"drug": "drug.h5", "control": "control.h5"}'
+        raise checks.input_error("results", what, rule)
+    return what
 
 
 @dataclass(frozen=True)
@@ -112,29 +109,28 @@ class CourseLine:
     style: str
 
 
-def _places(
-    frames: RecordedFrames, names: Mapping[int, str], colonies: Sequence[int] | None, most: int
-) -> tuple[list[int], str]:
-    """The places of the colonies to draw, and a note for the title if some are omitted. names: of
-    conditions, by place; most: of these at most so many, by default."""
-    checks.integer("most", most, least=1)
-    ids = frames.results.colony_id
-    found, more = choose_colonies(frames.shown(False), ids, colonies, len(ids))
-    places = [p for p in found if p in names]
-    if not places:
-        rule = "names of colonies that are drawn and have cells"
-        raise checks.input_error("conditions", list(names.values()), rule)
-    each = list(dict.fromkeys(names[p] for p in places))
-    if colonies is not None or len(each) <= most:
-        return places, more
-    kind = "colonies" if len(each) == len(places) else "conditions"
-    note = f"first {most} of {len(each)} {kind}"
-    return [p for p in places if names[p] in each[:most]], f" ({note}{more and ', ' + more[2:-1]})"
-
-
 def _sums(quantities: Sequence[str]) -> list[int]:
     """The panels whose values are of all cells of a colony, 0 without cells."""
     return [0, *(1 + k for k, name in enumerate(quantities) if name == BIOVOLUME)]
+
+
+def _draw_runs(
+    axes: Sequence[Axes],
+    courses: Sequence[RunCourse],
+    lines: Sequence[Sequence[CourseLine]],
+    sums: Sequence[int],
+) -> list[np.ndarray]:
+    """Draw the lines of each run, and return what they show, (frames, lines, panels, 3) of each."""
+    band, everything = sum(map(len, lines)) <= FEW, []
+    for course, own in zip(courses, lines, strict=True):
+        seen = course.values([(x.place, x.kind) for x in own])
+        failed = course.failed[:, [course.places.index(x.place) for x in own]]
+        everything.append(seen)
+        for label in dict.fromkeys(x.label for x in own):
+            same = np.array([k for k, x in enumerate(own) if x.label == label])
+            _draw_alike(axes, course.times, seen[:, same], [own[k] for k in same], failed[:, same],
+                        band=band, sums=sums)  # fmt: skip
+    return everything
 
 
 def _draw_alike(
@@ -199,31 +195,19 @@ def _draw_end(
     ax.scatter(times[begin], zero, s=size, color=line.colour, marker="v", zorder=3)
 
 
-def _failed(results: Results, lines: Sequence[CourseLine]) -> np.ndarray:
-    """(frames, lines) where the colony of a line has failed before."""
-    places = [x.place for x in lines]
-    counts = results.counts[:, places]
-    if counts[-1].all():
-        return np.zeros(counts.shape, bool)
-    tree = results.lineage()
-    failed = np.isin(results.colony_id[places], tree.colony[tree.fate == "failed"])
-    living = np.logical_or.accumulate(counts[::-1] > 0)[::-1]  # then or later
-    return failed & ~living
-
-
 def _gone(counts: np.ndarray) -> np.ndarray:
     """(frames, …) where no cells are left of those that were there before."""
     none = np.isnan(counts)
     return none & np.logical_or.accumulate(~none)
 
 
-def _scale_of_counts(counts: np.ndarray) -> str:
-    """Of the axis of numbers of cells, (frames, lines): logarithmic where they grow more than
-    tenfold, and linear from 0 to 1 below that, where cells die out."""
-    alive = counts[counts > 0]
+def _scale_of_counts(each: Sequence[np.ndarray]) -> str:
+    """Of the axis of numbers of cells, of each run (frames, lines): logarithmic where they grow
+    more than tenfold, and linear from 0 to 1 below that, where cells die out."""
+    alive = np.concatenate([counts[counts > 0] for counts in each])
     if alive.max(initial=0.0) <= TENFOLD * max(1, alive.min(initial=np.inf)):
         return "linear"
-    return "symlog" if _gone(counts).any() else "log"
+    return "symlog" if any(bool(_gone(counts).any()) for counts in each) else "log"
 
 
 def _mean(seen: np.ndarray) -> np.ndarray:
@@ -233,49 +217,31 @@ def _mean(seen: np.ndarray) -> np.ndarray:
     return np.divide(total, some.sum(1), out=np.full_like(total, np.nan), where=some.any(1))
 
 
-def _lines(
-    named: Mapping[int, str], kinds: Sequence[int], by: str | None, frames: RecordedFrames
-) -> list[CourseLine]:
-    """One for each colony, or for each kind of each. Those of one condition, a name by place, have
+def _lines(courses: Sequence[RunCourse], by: str | None) -> list[list[CourseLine]]:
+    """Those of each run: one for each colony, or for each kind of each. Those of one condition have
     the label and the colour in common; or with kinds, the style."""
-    labels = list(dict.fromkeys(named.values()))
+    labels = list(dict.fromkeys(name for course in courses for name in course.named.values()))
     if by is None:
         colours = dict(zip(labels, _colours(len(labels)), strict=True))
-        return [CourseLine(p, ALL, name, colours[name], "-") for p, name in named.items()]
+        return [
+            [CourseLine(p, ALL, name, colours[name], "-") for p, name in course.named.items()]
+            for course in courses
+        ]
     if len(labels) > len(STYLES):
         rule = f"colonies of up to {len(STYLES)} conditions where cells are told apart by {by!r}"
         raise checks.input_error("colonies", labels, rule, "See conditions=…")
-    several, own = len(frames[0].counts) > 1, frames[0].type_names if by == TYPES else ()
-    kind_name = {k: own[k] if 0 <= k < len(own) else f"{by} {k}" for k in kinds}
+    kinds = sorted(set[int]().union(*(course.kinds for course in courses)))
     styles = dict(zip(labels, STYLES, strict=False))
-    return [
-        CourseLine(p, kind, f"{name}, " * several + kind_name[kind], c, styles[name])
-        for p, name in named.items()
-        for kind, c in zip(kinds, _colours_of(kinds, by), strict=True)
-    ]
-
-
-def _seen(
-    cells: Columns, known: Columns, places: Sequence[int], by: str | None, names: Sequence[str]
-) -> dict[tuple[int, int], np.ndarray]:
-    """Of the cells of each place and kind their number, three times, and of each quantity the mean,
-    and the ends of the band, (1 + quantities, 3), or three times the sum; NaN without cells."""
-    kind = np.full(len(cells["uid"]), ALL) if by is None else known[by]
-    if kind.dtype.kind not in "iub":
-        raise checks.input_error("by", by, "a field of whole numbers, such as 'cell_type'")
-    out = {}
-    for one in [ALL] if by is None else np.unique(kind).tolist():
-        for place in places:
-            mine = (cells["colony"] == place) & (kind == one)
-            found = np.full((1 + len(names), 3), np.nan)
-            found[0] = mine.sum()
-            for row, name in enumerate(names):
-                values = known[VOLUME if name == BIOVOLUME else name][mine].astype(float)
-                if name == BIOVOLUME and len(values):
-                    found[1 + row] = values.sum()
-                elif len(values):
-                    found[1 + row] = values.mean(), *np.percentile(values, BAND)
-            out[place, one] = found
+    several = len(courses) > 1 or courses[0].several
+    out = []
+    for course in courses:
+        own = course.type_names if by == TYPES else ()
+        kind_name = {k: own[k] if 0 <= k < len(own) else f"{by} {k}" for k in kinds}
+        out.append([
+            CourseLine(p, kind, f"{name}, " * several + kind_name[kind], c, styles[name])
+            for p, name in course.named.items()
+            for kind, c in zip(kinds, _colours_of(kinds, by), strict=True)
+        ])  # fmt: skip
     return out
 
 
@@ -306,18 +272,25 @@ def _legend(ax: Axes) -> None:
 
 
 def _finish_all(
-    axes: Sequence[Axes], results: Results, quantities: Sequence[str], seen: np.ndarray, log: bool
+    axes: Sequence[Axes],
+    courses: Sequence[RunCourse],
+    quantities: Sequence[str],
+    seen: Sequence[np.ndarray],
+    log: bool,
 ) -> None:
-    """Label the panels and scale their axes. seen: (frames, lines, panels, 3)."""
-    _finish(axes[0], "cells", _scale_of_counts(seen[:, :, 0, 0]))
+    """Label the panels and scale their axes. seen: of each run, (frames, lines, panels, 3)."""
+    _finish(axes[0], "cells", _scale_of_counts([x[:, :, 0, 0] for x in seen]))
     for row, name in enumerate(quantities):
-        total = name == BIOVOLUME
-        unit = "µm³" if total else unit_at_cells(results, name)
-        some = bool((seen[:, :, 1 + row] > 0).any())  # or there is no logarithm
-        words = name if total else f"mean of {name}"
+        unit = courses[0].units[name]
+        some = any(bool((x[:, :, 1 + row] > 0).any()) for x in seen)  # or there is no logarithm
+        words = name if name == BIOVOLUME else f"mean of {name}"
         _finish(
             axes[1 + row], words + f" ({unit})" * bool(unit), "log" if log and some else "linear"
         )
+    axes[-1].set_xlabel("time (h)")
+    # of the runs, also where their last cells died before
+    ends = np.array([min(x.times[0] for x in courses), max(x.times[-1] for x in courses)])
+    axes[-1].set_xlim(*(ends + 0.05 * np.diff(ends) * [-1, 1]))
 
 
 def _finish(ax: Axes, label: str, scale: str) -> None:
