@@ -300,13 +300,13 @@ def test_conditions_set_them():
         ),
         (
             lambda: scene(tf.Founders(shared, share=[0.5, 0.2])).bind(3),
-            "2 values per colony.*one value for each of the 3 colonies",
+            "2 values per colony of share'.*one value for each of the 3 colonies",
         ),
         (
             lambda: scene(tf.Founders(shared, share=[0.5, 0.2])).bind(
                 state=scene().bind(3).start()
             ),
-            "2 values per colony.*one value for each of the 3 colonies",
+            "2 values per colony of share'.*one value for each of the 3 colonies",
         ),
         (
             lambda: tf.GrowthRecording(

@@ -111,7 +111,9 @@ class Founders:
         """Raise InputError unless there is a value for each of so many colonies."""
         if self.colonies not in (None, count):
             rule = f"one value for each of the {count} colonies of the batch"
-            raise checks.input_error("Founders", f"{self.colonies} values per colony", rule)
+            names = ", ".join(n for n, x in self.values.items() if isinstance(x, list))
+            given = f"{self.colonies} values per colony of {names}"
+            raise checks.input_error("Founders", given, rule)
 
     def one(self, seed: int, colony: int = 0, like: Cells | None = None) -> Cells:
         """The founders of a colony from a seed. Raises InputError unless they are cells of one

@@ -64,6 +64,8 @@ AT_ONCE = {
         r"Circuit\.daughters = 'copy'.*'concentration', 'amount'",
     ),
     "method": (bad(idle, method="rk5"), r"Circuit\.method = 'rk5'.*'rosenbrock'"),
+    "gillespie": (bad(idle, method="Gillespie"), r"'Gillespie'.*Write 'direct', which serves"),
+    "lsoda": (bad(idle, method="lsoda"), r"'lsoda'.*Write 'rosenbrock', which serves"),
     "steps": (bad(idle, method="rk4", steps=0), r"Circuit\.steps = 0"),
     "rtol": (bad(idle, rtol=0.0), r"Circuit\.rtol"),
     "atol": (bad(idle, atol=-1.0), r"Circuit\.atol"),

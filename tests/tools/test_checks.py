@@ -44,6 +44,11 @@ def test_names_that_are_nearly_right_get_the_right_one(call, message):
         call()
 
 
+def test_names_are_near_whatever_their_case_and_hyphens():
+    assert checks.suggestion("CMA-ES", ["sobol", "cmaes"]) == "Did you mean 'cmaes'?"
+    assert checks.suggestion("Tau leap", ["direct", "tau_leap"]) == "Did you mean 'tau_leap'?"
+
+
 def test_nothing_is_suggested_for_what_is_no_name():
     assert checks.suggestion(3, ["a"]) == checks.suggestion("zebra", ["rate", 5]) == ""
 

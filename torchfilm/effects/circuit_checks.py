@@ -26,6 +26,9 @@ from torchfilm.values import COLONY, FORMS, Rule, checked, numbers
 STIFF, LEAP, DIRECT = "rosenbrock", "tau_leap", "direct"
 EXPLICIT = ("euler", *integrators.METHODS)
 METHODS = (STIFF, *EXPLICIT, LEAP, DIRECT)
+# what others call methods of the same use: Gillespie's algorithm, and one for stiff rates
+OTHER_NAMES = dict.fromkeys(("gillespie", "ssa"), DIRECT)
+OTHER_NAMES |= dict.fromkeys(("stiff", "bdf", "lsoda", "cvode"), STIFF)
 GEOMETRY = ("volume", "area", "x", "y", "z")
 # Fields that effects read where there are any, by what they are for.
 READ_BY_OTHERS = {"drag": "mechanics takes 'drag' as how much a cell resists motion"}
@@ -163,6 +166,11 @@ def check_constants(given: Mapping[str, Any], options: Sequence[str]) -> None:
 
 
 def check_method(method: str, steps: int, by_type: Mapping[int | str, Any]) -> None:
+    if isinstance(method, str) and (ours := OTHER_NAMES.get(method.lower())):
+        rule = f"one of {', '.join(map(repr, METHODS))}"
+        raise checks.input_error(
+            "Circuit.method", method, rule, f"Write {ours!r}, which serves the same use."
+        )
     checks.choice("Circuit.method", method, METHODS)
     checks.integer("Circuit.steps", steps, least=1)
     functions = [part for part in by_type.values() if callable(part)]

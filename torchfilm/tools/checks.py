@@ -62,8 +62,8 @@ def install(extra: str) -> str:
 def nearest(given: str, known: Iterable[str]) -> str | None:
     """The known name that was probably meant: a similar one, or one that begins the given name or
     begins with it ("dim" for "dimension"). None: no name is near."""
-    known = list(known)
-    near = [n for n in known if n.lower() == given.lower()]
+    known, plain = list(known), lambda n: "".join(filter(str.isalnum, n.lower()))
+    near = [n for n in known if plain(n) == plain(given)]
     near = near or difflib.get_close_matches(given, known, n=1)
     if near:
         return near[0]
