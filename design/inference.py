@@ -23,10 +23,10 @@ from design.progress import advance, open_bar
 from design.region import Region
 from design.simulations import Simulations, simulate_designs
 from design.targets.conditions import Conditions
-from design.targets.measured import Measured
+from design.targets.measured import Measured, extinct_words
 from design.targets.observed import Observed
 from design.targets.observed_conditions import checked_data, grown
-from design.task import Task
+from design.task import SURVIVORS, Task
 from torchfilm import checks
 
 LEAST = 50  # simulations that succeeded
@@ -41,22 +41,19 @@ def infer(
     *,
     simulations: int = 5000,
     rounds: int = 1,
-    cells: int | None = None,
-    until: float | None = None,
-    replicates: int | None = None,
+    cells: int | None = None, until: float | None = None,
+    replicates: int | None = None, reduce: str = "mean",
     fixed: Mapping[str, Any] | None = None,
     prior: Mapping[str, Any] | None = None,
     seed: int = 0,
-    dt: float | None = None,
-    dtype: torch.dtype = torch.float32,
-    device: str = "cpu",
+    dt: float | None = None, dtype: torch.dtype = torch.float32, device: str = "cpu",
     path: str | Path | None = None,
     samples: int = 4000,
     flows: int = 2,
     epochs: int = 400,
     executor: Executor | None = None,
     progress: bool | None = None,
-) -> Posterior:
+) -> Posterior:  # fmt: skip
     """The parameters of a scene that could have grown the observed colonies, as a posterior.
 
         posterior = infer(my_scene, [Parameter("rate", 0.5, 2, log=True)], observed, until=5.0)
@@ -76,7 +73,9 @@ def infer(
 
     scene, parameters, cells, fixed, seed, dt, dtype, device: as for `Search`. until: h, by default
     when the data were observed. replicates: with fewer than were observed, the posterior is wider
-    than the data allow. prior: what is known before, by the names of parameters: for a number a
+    than the data allow. reduce: "survivors" where those that died out were not observed: only
+    simulated ones that live on are averaged, up to as many as were observed; give more replicates,
+    so that as many live. prior: what is known before, by the names of parameters: for a number a
     frozen distribution of scipy.stats, for a choice the share of each option (`Prior`). path: a
     file that keeps the simulations, also for other data of the same statistics; what is learnt is
     kept beside it, and the same again takes seconds. samples: of the posterior. flows: of the
@@ -92,7 +91,8 @@ def infer(
     task = Task(
         scene, parameters, grown(data), cells=cells, until=until,
         replicates=data.colonies if replicates is None else replicates,
-        fixed=fixed, seed=seed, dt=dt, dtype=dtype, device=device, replay=False,
+        reduce=_checked(reduce), fixed=fixed, seed=seed, dt=dt, dtype=dtype, device=device,
+        replay=False,
     )  # fmt: skip
     known = Prior(task.space, prior)
     levels, learnt = _options_in(task.space), LearntNetworks.beside(kept)
@@ -104,6 +104,11 @@ def infer(
     if posterior.other_sizes:
         checks.warn(posterior.other_sizes)
     return posterior
+
+
+def _checked(reduce: str) -> str:
+    checks.choice("reduce", reduce, ("mean", SURVIVORS))
+    return reduce
 
 
 def _check_counts(simulations: int, rounds: int, *, samples: int, flows: int, epochs: int) -> None:
@@ -189,7 +194,7 @@ def _in_rounds(
     regions: tuple[Region, ...] = (Region.whole(task.space.size),)
     while True:
         upto = count * len(regions) // rounds
-        found = _simulate(simulate, regions, upto, task.replicates, estimation.progress)
+        found = _simulate(simulate, data, regions, upto, task.replicates, estimation.progress)
         if len(found.regions) > len(regions):
             regions = found.regions[: len(regions) + 1]
             continue
@@ -202,6 +207,7 @@ def _in_rounds(
 
 def _simulate(
     simulate: Callable[..., Simulations],
+    data: Observed,
     regions: tuple[Region, ...],
     count: int,
     each: int,
@@ -218,7 +224,8 @@ def _simulate(
         why = "".join(
             f"; the most frequent reason of failure: {w}" for w, _ in found.failures()[:1]
         )
+        hint = "".join(f". {words}" for words in extinct_words(data, found.reasons.values()))
         raise tf.InputError(
-            f"{sound} of {tried} simulations succeeded, and {LEAST} are needed{why}"
+            f"{sound} of {tried} simulations succeeded, and {LEAST} are needed{why}{hint}"
         )
     return found

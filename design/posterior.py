@@ -22,7 +22,7 @@ from design.targets.measured import Measured, extinct_words
 from design.targets.observed import Observed
 from design.targets.observed_conditions import averaged, cells_each, checked_data, standard_errors
 from design.targets.statistics import LOG_CELLS
-from design.task import Task
+from design.task import SURVIVORS, Task
 from torchfilm import checks
 
 LEVEL = 0.9  # of intervals, unless a caller gives one
@@ -188,7 +188,8 @@ class Posterior:
         lines += [f"{n} simulations failed: {why}" for why, n in failures[:3]]
         if len(failures) > 3:
             lines.append(f"{sum(n for _, n in failures[3:])} simulations failed for other reasons")
-        lines += extinct_words(self.observed, [why for why, _ in failures])
+        if self.task.reduce != SURVIVORS:
+            lines += extinct_words(self.observed, [why for why, _ in failures])
         lines += told_together(self.correlations)
         if self.other_sizes:
             lines.append(self.other_sizes)

@@ -19,7 +19,7 @@ from design.targets.base import Target
 from design.targets.goals import MANY, Constrained, Goals, constrained
 from design.targets.lasting import Lasting
 from design.targets.measured import extinct_words, has_mean_with_error
-from design.task import Task
+from design.task import SURVIVORS, Task
 from design.trivial import EVERY_SECOND, trivial_losses
 from torchfilm import displays
 
@@ -102,8 +102,10 @@ def table(report: SearchReport) -> str:
 
 
 def failure_words(study: Study, target: Target) -> list[str]:
-    """The most frequent failure of a search, if there is one."""
+    """The most frequent failure of a search, if there is one; or what it left out."""
     each = study.failures()
+    if each and study.about.get("reduce") == SURVIVORS:
+        return [f"left out: {reason} ({times} colonies)" for reason, times in each[:3]]
     lines = [f"most frequent failure: {reason} ({times} colonies)" for reason, times in each[:1]]
     return lines + extinct_words(target, [reason for reason, _ in each])
 
@@ -157,7 +159,9 @@ def _seeds(task: Task, fresh: FreshLosses) -> str:
     low, high = fresh.band
     by = ", which chose it" if fresh.chosen else ""
     if failed.any():
-        by += f"; {failed.sum()} of them failed, each counts {show_loss(task.target.failed)}"
+        each = f"each counts {show_loss(task.target.failed)}"
+        each = "left out" if task.reduce == SURVIVORS else each
+        by += f"; {failed.sum()} of them failed, {each}"
     if math.isinf(high):
         by += f"; an upper end takes {seeds_of_an_end(task)}"
     return f"{show_loss(low)} … {show_loss(high)}, {seeds} seeds{by}"
@@ -246,7 +250,7 @@ def _lucky(report: SearchReport) -> str:
     if fresh is None:
         return ""
     here, there, low = best.loss, fresh.loss, fresh.band[0]
-    if report.task.reduce != "mean":
+    if report.task.reduce not in ("mean", SURVIVORS):
         here, there = float(np.mean(best.losses)), float(np.mean(fresh.losses))
         low = there - SPREADS * float(np.std(fresh.losses)) / math.sqrt(len(fresh.losses))
     if not here < low - (1 - LUCKY) * abs(low):

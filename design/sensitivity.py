@@ -12,6 +12,7 @@ from scipy.stats import qmc, sobol_indices
 
 from design.objective import Objective
 from design.progress import advance
+from design.task import SURVIVORS
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -59,7 +60,7 @@ def loss_indices(
     for begin in range(0, len(points), DESIGNS):
         part = slice(begin, begin + DESIGNS)
         found = objective.evaluate(points[part], executor=executor, work_items=work_items)
-        losses[part] = found.losses.mean(1)
+        losses[part] = found.loss if task.reduce == SURVIVORS else found.losses.mean(1)
         advance(bar, found.losses.size)
     rows = losses.reshape(size + 2, samples)
     first, total = _estimate(rows)

@@ -27,7 +27,7 @@ from design.region import Region
 from design.scoring import WorkItem, cut_work_items, in_halves
 from design.targets.observed import Observed
 from design.targets.observed_conditions import averaged, checked_data, errors, places
-from design.task import Task
+from design.task import SURVIVORS, Task
 from torchfilm import checks
 
 FORMAT, VERSION = "torchfilm simulations", 1
@@ -93,7 +93,9 @@ def about(task: Task, prior: Prior, rounds: tuple[int, int] | None = None) -> di
     """What simulations depend on, as plain data: all of the task but the observed numbers, which
     those of several rounds depend on, too. rounds: how many simulations, in how many rounds."""
     found = task.describe() | {"target": repr(observed_of(task).plan)}
-    del found["code of the target"], found["reduce"]
+    del found["code of the target"]
+    if task.reduce != SURVIVORS:
+        del found["reduce"]
     if prior.given:
         found["prior"] = prior.describe()
     if rounds is not None:
@@ -188,7 +190,7 @@ def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.nda
     prepared = colonies.prepare(scene, streams, task.settings)
     found = np.full((len(streams), len(observed.values)), np.nan)
     counts = np.full(len(streams), np.nan)
-    reasons: dict[int, str] = {}
+    good, reasons = np.zeros(len(streams), bool), dict[int, str]()
     cells, until = task.end(1.0)
     fewest = task.target.fewest
     for event in grow(prepared, cells=cells, until=until, note=observed.note, fewest=fewest):
@@ -196,23 +198,33 @@ def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.nda
             reasons[event.colony_id // each] = event.reason
             continue
         ids = event.state.colony_id.cpu().numpy()
+        good[ids] = True
         found[ids] = observed.statistics(event.state, event.history).cpu().numpy()
         counts[ids] = event.state.counts.cpu().numpy()
         for colony_id, why in zip(ids.tolist(), observed.unfit(event.state), strict=True):
             if why:  # it has stopped before the data were observed
-                found[colony_id] = np.nan
+                found[colony_id], good[colony_id] = np.nan, False
                 reasons[colony_id // each] = why
     # of the colonies of a replicate, each statistic is that of the one under its condition
     columns = np.arange(len(observed.values))
     shape = (len(item.rows), task.replicates, task.conditions, len(columns))
     each_own = found.reshape(shape)[:, :, places(observed), columns]
-    means = _means(each_own, np.array(averaged(observed, task.replicates)))
+    if task.reduce == SURVIVORS:
+        living = good.reshape(shape[:3])[:, :, places(observed)]
+        own = np.array(averaged(observed, observed.colonies))
+        means = _means_of_living(each_own, own, living)
+        reasons = {k: why for k, why in reasons.items() if not living[k].any(0).all()}
+    else:
+        means = _means(each_own, np.array(averaged(observed, task.replicates)))
     names = observed.plan.names
     for k in np.flatnonzero(~np.isfinite(means).all(1)).tolist():
         name = names[int(np.flatnonzero(~np.isfinite(means[k]))[0])]
         why = observed.why_undefined(name)
         reasons.setdefault(k, f"{name} is not a number{f', as {why}' if why else ''}")
-    size = counts.reshape(len(item.rows), each).mean(1).tolist()
+    counted = counts.reshape(len(item.rows), each)
+    if task.reduce == SURVIVORS:
+        counted = _means_of_living(counted[..., None], np.array([each]), good.reshape(-1, each, 1))
+    size = counted.mean(1).tolist()
     return [(row, means[k], size[k], reasons.get(k, "")) for k, row in enumerate(item.rows)]
 
 
@@ -221,6 +233,15 @@ def _means(found: np.ndarray, count: np.ndarray) -> np.ndarray:
     any replicate is."""
     within = np.arange(found.shape[1])[:, None] < count
     return (found * within).sum(1) / count
+
+
+def _means_of_living(found: np.ndarray, count: np.ndarray, living: np.ndarray) -> np.ndarray:
+    """Of each statistic over the first `count` (K,) of the replicates that live, or all where they
+    are fewer: (n, K) from (n, R, K). living: (n, R, K). NaN where none does, or one of them is."""
+    within = living & (living.cumsum(1) <= count)
+    number = within.sum(1)
+    total = np.where(within, found, 0.0).sum(1)
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
 
 
 def _points(prior: Prior, draws: np.ndarray, regions: Sequence[Region]) -> np.ndarray:

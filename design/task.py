@@ -34,7 +34,8 @@ from torchfilm import checks
 
 NONE = cast(Target, None)  # the target where `targets` are given
 COUNTS = {"cells": 2, "replicates": 1, "most": 1, "seed": 0}  # and the least of each
-REDUCE = ("mean", "worst")
+SURVIVORS = "survivors"  # the mean of the replicates that did not fail, as by dying out
+REDUCE = ("mean", "worst", SURVIVORS)
 TOO_MANY, NEVER = 1e8, 1e30  # cells of a colony: of which is warned, and which none can have
 SHORTEST = 1000  # parts of the first time among which a step is looked for
 # what studies say of the course of a step: losses of another one do not compare
@@ -54,9 +55,10 @@ class TaskOptions(metaclass=checks.KnownKeywords):
     then, or than its target needs (10 for patterns), has failed. Of data with a time both may be
     left out. replicates: colonies of each design.
     Replicate k of every design follows stream k of random numbers, so that designs are compared on
-    equal terms. reduce: how the losses of the replicates become one loss: "mean", "worst", or a
-    quantile such as 0.75. seed, dt (h, by default the scene's), dtype, device: as for
-    `tf.simulate`. replay: run circuits on recorded growth where the scene allows it. most: the
+    equal terms. reduce: how the losses of the replicates become one loss: "mean", "worst", a
+    quantile such as 0.75, or "survivors", the mean of those that did not fail, as by dying out;
+    where all did, the design has failed. seed, dt (h, by default the scene's), dtype, device: as
+    for `tf.simulate`. replay: run circuits on recorded growth where the scene allows it. most: the
     greatest number of colonies in one batch; by default as many as fit into memory.
     """
 
@@ -225,6 +227,10 @@ class Task(TaskOptions):
             return losses.mean(1)
         if self.reduce == "worst":
             return losses.max(1)
+        if self.reduce == SURVIVORS:
+            failed = (target or self.target).failed
+            mean = (np.nan_to_num(losses, nan=0.0) * _share_of_living(losses, failed)).sum(1)
+            return np.where((losses < failed).any(1), mean, failed)
         return np.quantile(losses, float(self.reduce), axis=1)
 
     @property
@@ -254,13 +260,17 @@ class Task(TaskOptions):
         if not isinstance(self.target, Goals):
             return None
         each = [self.reduced(losses[:, :, k], part) for k, part in enumerate(self.target.parts)]
-        return np.where(np.isnan(losses).any(1), np.nan, np.stack(each, 1))
+        failed = np.isnan(losses).any(2)
+        none = failed.all(1) if self.reduce == SURVIVORS else failed.any(1)
+        return np.where(none[:, None], np.nan, np.stack(each, 1))
 
     def shares(self, losses: np.ndarray) -> np.ndarray:
         """The derivative of `reduced` by the losses, (n, R)."""
         count = losses.shape[1]
         if self.reduce == "mean":
             return np.full(losses.shape, 1.0 / count)
+        if self.reduce == SURVIVORS:
+            return _share_of_living(losses, self.target.failed)
         quantile = 1.0 if self.reduce == "worst" else float(self.reduce)
         order, place = np.argsort(losses, 1, kind="stable"), quantile * (count - 1)
         below, above = math.floor(place), math.ceil(place)
@@ -340,9 +350,15 @@ def _check_options(options: TaskOptions) -> float | None:
         isinstance(reduce, bool) or not isinstance(reduce, (int, float)) or not 0 < reduce <= 1
     ):
         raise checks.input_error(
-            "reduce", reduce, '"mean", "worst" or a quantile above 0 and at most 1'
+            "reduce", reduce, '"mean", "worst", "survivors" or a quantile above 0 and at most 1'
         )
     return None if options.until is None else checks.number("until", options.until, above=0.0)
+
+
+def _share_of_living(losses: np.ndarray, failed: float) -> np.ndarray:
+    """The share of each replicate in the mean of those that did not fail, (n, R)."""
+    living = losses < failed
+    return living / np.maximum(living.sum(1, keepdims=True), 1)
 
 
 def _whole_numbers(given: Any) -> list[int]:

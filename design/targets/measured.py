@@ -349,11 +349,16 @@ def has_mean_with_error(target: object) -> bool:
 
 
 def extinct_words(target: Target, reasons: Iterable[str]) -> list[str]:
-    """What to know where colonies without cells have failed that a target could measure. reasons:
-    of failures."""
-    if any(reason.startswith(NO_CELLS) for reason in reasons) and _leaves_out_extinct(target):
+    """What to know where colonies without cells have failed that a target could measure, or leave
+    out. reasons: of failures."""
+    if not any(reason.startswith(NO_CELLS) for reason in reasons):
+        return []
+    if _leaves_out_extinct(target):
         return ["colonies without cells have failed; extinct=True of the measures measures them"]
-    return []
+    if not target.evidence:
+        return []
+    words = 'if the observed ones are those that lived on, reduce="survivors" leaves such out'
+    return [f"colonies without cells have failed; {words}"]
 
 
 def _leaves_out_extinct(target: object) -> bool:

@@ -86,8 +86,8 @@ def _warn_of_gone(source: str, last: Mapping[Any, float]) -> None:
             f"{source}: {len(gone)} of {len(last)} colonies are not there any more at {end:g} h"
             f" ({shown}). If they died out, the frames are of those that live on, while simulated"
             " colonies that die out fail: a search then finds fewer deaths than there were."
-            " Measured(…, extinct=True) and ObservedCourse.of_measures(…, extinct=True) measure"
-            " those, too."
+            ' reduce="survivors" leaves those out; Measured(…, extinct=True) and'
+            " ObservedCourse.of_measures(…, extinct=True) measure them, too."
         )
 
 
