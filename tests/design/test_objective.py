@@ -307,7 +307,7 @@ def ungrown(make=1.0):
         ({"replicates": 0}, "replicates = 0.*whole number from 1"),
         ({"most": 0}, "most = 0.*whole number from 1"),
         ({"seed": -1}, "^seed = -1.*whole number from 0"),
-        ({"reduce": "best"}, "reduce = 'best'.*\"worst\" or a quantile"),
+        ({"reduce": "best"}, "reduce = 'best'.*\"survivors\" or a quantile"),
         ({"reduce": 0.0}, "reduce = 0.0.*above 0"),
         ({"scene": lit()}, "a function from parameters to a tf.Scene.*def scene"),
         ({"scene": "colony"}, "scene = 'colony'.*one of microcolony"),
