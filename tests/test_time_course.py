@@ -349,3 +349,5 @@ def test_several_runs_in_one_picture(tmp_path):
             tf.pictures.time_course(wrong)
     with pytest.raises(tf.InputError, match="another file than the results"):
         tf.pictures.time_course({"a": dead, "b": long}, out=long)
+    with pytest.raises(tf.InputError, match=r"run 'none': conditions = 'rate'.*this file has none"):
+        tf.pictures.time_course({"lysis": doses, "none": long}, conditions="rate")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -69,7 +70,7 @@ def time_course(
         most = min(most, max(1, len(STYLES) // len(runs)))
     courses = []
     for name, one in runs.items():
-        with opened(one) as results:
+        with opened(one) as results, _named(name):
             check_not_results(results.path, out)
             courses.append(run_course(results, name, quantities, by, conditions, colonies, most))
     lines = _lines(courses, by)
@@ -82,6 +83,15 @@ def time_course(
     titles = ", ".join(dict.fromkeys(x.title for x in courses))
     figure.suptitle(titles, fontsize=9, parse_math=False)
     return Picture(figure, out)
+
+
+@contextlib.contextmanager
+def _named(run: str) -> Iterator[None]:
+    """Raise InputErrors with the name of the run, if it is one of several."""
+    try:
+        yield
+    except checks.InputError as error:
+        raise checks.InputError(f"run {run!r}: {error}" if run else str(error)) from error
 
 
 def _runs(what: Any) -> Mapping[str, Any]:
