@@ -25,6 +25,7 @@ from design.prior import Prior
 from design.reasons import tally
 from design.region import Region
 from design.scoring import WorkItem, cut_work_items, in_halves
+from design.targets.measured import NO_CELLS
 from design.targets.observed import Observed
 from design.targets.observed_conditions import averaged, checked_data, errors, places
 from design.task import SURVIVORS, Task
@@ -190,12 +191,14 @@ def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.nda
     prepared = colonies.prepare(scene, streams, task.settings)
     found = np.full((len(streams), len(observed.values)), np.nan)
     counts = np.full(len(streams), np.nan)
-    good, reasons = np.zeros(len(streams), bool), dict[int, str]()
+    good = np.zeros(len(streams), bool)
+    gone, reasons = dict[int, str](), dict[int, str]()
     cells, until = task.end(1.0)
     fewest = task.target.fewest
     for event in grow(prepared, cells=cells, until=until, note=observed.note, fewest=fewest):
         if isinstance(event, FailedColony):
-            reasons[event.colony_id // each] = event.reason
+            died = task.reduce == SURVIVORS and event.reason.startswith(NO_CELLS)
+            (gone if died else reasons)[event.colony_id // each] = event.reason
             continue
         ids = event.state.colony_id.cpu().numpy()
         good[ids] = True
@@ -213,7 +216,7 @@ def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.nda
         living = good.reshape(shape[:3])[:, :, places(observed)]
         own = np.array(averaged(observed, observed.colonies))
         means = _means_of_living(each_own, own, living)
-        reasons = {k: why for k, why in reasons.items() if not living[k].any(0).all()}
+        reasons = {k: x for k, x in gone.items() if not living[k].any(0).all()} | reasons
     else:
         means = _means(each_own, np.array(averaged(observed, task.replicates)))
     names = observed.plan.names

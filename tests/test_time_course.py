@@ -351,3 +351,22 @@ def test_several_runs_in_one_picture(tmp_path):
         tf.pictures.time_course({"a": dead, "b": long}, out=long)
     with pytest.raises(tf.InputError, match=r"run 'none': conditions = 'rate'.*this file has none"):
         tf.pictures.time_course({"lysis": doses, "none": long}, conditions="rate")
+
+
+def test_designs_of_a_run_are_no_replicates(tmp_path):
+    def run(name, *values):
+        scene = tf.Scene(
+            tf.Growth(rate=values[0]), tf.Division(length=values[1]), tf.Lysis(rate=values[2]),
+            dt=0.1, name=name,
+        )  # fmt: skip
+        record = tf.Recorder(tmp_path / name, scene, every=1)
+        tf.simulate(scene, until=0.5, colonies=2, record=record).last()
+        return tmp_path / name
+
+    pair = lambda one, other: torch.tensor([one, other])
+    many = run("many.h5", pair(1.0, 1.2), pair(3.0, 4.0), pair(0.0, 0.1))
+    runs = {"designs": many, "control": run("control.h5", 1.0, 3.0, 0.0)}
+    legend = tf.pictures.time_course(runs).figure.axes[0].get_legend()
+    assert [t.get_text() for t in legend.texts] == [
+        "designs, colony 0", "designs, colony 1", "control, mean of 2",
+    ]  # fmt: skip

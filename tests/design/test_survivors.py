@@ -102,6 +102,19 @@ def test_a_design_of_which_none_lives_has_failed(living):
     assert np.isnan(found.statistics[0]).all() and np.isfinite(found.statistics[1]).all()
 
 
+def test_a_colony_that_fails_otherwise_is_not_left_out(living):
+    def broken(kill=0.9):
+        def breaks(u, state, p, cell):
+            return {"m": u.m * u.m}  # infinite after some 0.3 h
+
+        circuit = tf.Circuit(breaks, species="m", initial={"m": 4.0}, method="rk4")
+        return tf.Scene(*culture(kill).effects, circuit, dim=2, dt=0.05)
+
+    task = Task(broken, KILL, living[1], replicates=5, reduce="survivors", replay=False)
+    found = simulate_points(task, np.array([[0.0]]), 0)
+    assert "m" in found.reasons[0] and "no cells" not in found.reasons[0]
+
+
 def test_simulations_of_survivors_are_others(living):
     from design.prior import Prior
 

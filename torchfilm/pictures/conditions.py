@@ -49,7 +49,8 @@ def condition_names(
     else the colony's id. run: the name of one of several runs, with which those of its conditions
     begin; without such parameters the colonies of a run are replicates."""
     if run:
-        if conditions is None and _by_parameters(results) is None:
+        differ = any((x != x[:1]).any() for k in (0, -1) for x in results.parameters(k).values())
+        if conditions is None and not differ:
             return dict.fromkeys(range(len(results.colony_id)), run)
         return {k: f"{run}, {name}" for k, name in condition_names(results, conditions).items()}
     ids = results.colony_id.tolist()
