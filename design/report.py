@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from design.data_means import means_off
 from design.finals import FreshLosses
 from design.growing import FinishedColonies
 from design.loss_bands import seeds_of_an_end
@@ -88,6 +89,7 @@ def table(report: SearchReport) -> str:
         rows.append((*row, seen.get(name, "")) if seen else row)
     lines = displays.aligned(rows, left=(0, 1, 4, 5))
     lines += _undefined(target, new)
+    lines += filter(None, [means_off(target, new)])
     lines += _warnings(report)
     lines += failure_words(study, target)
     how = (

@@ -446,6 +446,10 @@ def test_a_table_of_all_frames_is_that_of_each(tmp_path, monkeypatch, most):
 def test_the_correlation_of_a_distribution_is_named_with_it():
     paths = ["Growth.rate.median", "Growth.rate.inherited"]
     assert list(column_names(paths, set()).values()) == ["rate.median", "rate.inherited"]
+    pulses = ["Growth.rate", "Lysis.rate.values[2.0]", "Lysis.rate.values[3.0]"]
+    names = ["Growth.rate", "Lysis.rate[2.0]", "Lysis.rate[3.0]"]  # which rate a pulse is of
+    assert list(column_names(pulses, set()).values()) == names
+    assert list(column_names(pulses[1:], set()).values()) == ["rate[2.0]", "rate[3.0]"]
 
 
 @pytest.mark.parametrize("value", [2**63 - 1, -1, 10**6])

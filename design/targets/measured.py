@@ -130,7 +130,8 @@ class Measured(Target):
             Measured.of_colonies({"donors": count_of(0)}, {"donors": [31, 25, 40, 28]}, time=3.0)
 
         values: by name, as many numbers as colonies, three at least. Wanted is their mean, and the
-        spread is their standard deviation, at least 1 % of the greatest number, so that a colony
+        spread is their standard deviation, at least 1 % of the greatest number, and of whole
+        numbers with extinct=True at least 1/√n, as if one colony had one more, so that a colony
         like them has a loss of about 1, of n some (1 + 1/n)(n − 1)/(n − 3): 2.4 of five. error: of
         measurement, of the mean; by default 0, as of counts. The rest is as of `Measured`. Raises
         InputError for other names and numbers.
@@ -143,7 +144,8 @@ class Measured(Target):
             label = f"Measured.of_colonies: values[{name!r}]"
             rows[name] = np.asarray(checks.vector(label, numbers))[None]
         rule = "as many numbers of each, one for each colony"
-        means, spreads, colonies = means_and_spreads("Measured.of_colonies: values", rows, rule)
+        label = "Measured.of_colonies: values"
+        means, spreads, colonies = means_and_spreads(label, rows, rule, extinct)
         wanted, spread = ({n: float(x[0]) for n, x in of.items()} for of in (means, spreads))
         return Measured(
             functions, wanted, spread, extinct=extinct, smooth=smooth, time=time,
@@ -263,21 +265,30 @@ def checked_columns(
 
 
 def means_and_spreads(
-    label: str, rows: Mapping[str, np.ndarray], alike: str
+    label: str, rows: Mapping[str, np.ndarray], alike: str, extinct: bool
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], int]:
     """Means and spreads by name, (T,) each, of numbers by time and colony (T, C), and the number of
-    colonies. alike: what the numbers must be, where they are not of as many colonies."""
-    found = {name: _mean_and_spread(f"{label}[{name!r}]", x) for name, x in rows.items()}
+    colonies. alike: what the numbers must be, where they are not of as many colonies. extinct:
+    whether colonies without cells are measured; else zeros at the end are warned of."""
+    found = {name: _mean_and_spread(f"{label}[{name!r}]", x, extinct) for name, x in rows.items()}
     counts = {name: x.shape[1] for name, x in rows.items()}
     if len(set(counts.values())) > 1:
         raise checks.input_error(label, counts, alike)
+    none = int(np.stack([x[-1] == 0 for x in rows.values()]).all(0).sum())
+    if none and not extinct:
+        checks.warn(
+            f"{label}: {none} of {next(iter(counts.values()))} colonies are 0. If they died out,"
+            " say extinct=True: else simulated colonies that die out fail, and a search finds fewer"
+            " deaths than there were."
+        )
     means, spreads = ({name: pair[k] for name, pair in found.items()} for k in (0, 1))
     return means, spreads, next(iter(counts.values()))
 
 
-def _mean_and_spread(label: str, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _mean_and_spread(label: str, rows: np.ndarray, extinct: bool) -> tuple[np.ndarray, np.ndarray]:
     """The means of a measure over colonies, (T,), of its numbers at each time (T, C), and how much
-    colonies differ, (T,)."""
+    colonies differ, (T,). Of whole numbers of colonies that may die out that is as if one of them
+    had one more, at least: of none that is left, too."""
     if rows.shape[1] < ENOUGH:
         rule = (
             f"numbers of {ENOUGH} colonies at least, since fewer do not tell how much they differ"
@@ -285,8 +296,10 @@ def _mean_and_spread(label: str, rows: np.ndarray) -> tuple[np.ndarray, np.ndarr
         raise checks.input_error(label, rows.tolist(), rule, "Give Measured their mean and spread.")
     greatest = np.abs(rows).max(1)
     least = FINEST * np.where(greatest == 0, np.nanmax(greatest), greatest)
+    if extinct and (np.isnan(rows) | (rows % 1 == 0)).all():
+        least = np.maximum(least, 1.0 / math.sqrt(rows.shape[1]))
     if not np.nanmax(least) > 0:
-        hint = "Give Measured the spread, or leave it out."
+        hint = "If all colonies died out, say extinct=True. Else give Measured the spread."
         raise checks.input_error(label, rows.tolist(), "numbers of which one is not 0", hint)
     return rows.mean(1), np.maximum(rows.std(1, ddof=1), least)
 

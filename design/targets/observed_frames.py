@@ -119,7 +119,7 @@ def measured_frames(
     given = dict(checked_columns(f"{MEASURES}: values", values, functions))
     columns: dict[str, dict[str, Any]] = {}
     if any(map(_is_table, given.values())):
-        columns["wanted"], columns["spread"], count = _of_colonies(given, moments, spread)
+        columns["wanted"], columns["spread"], count = _of_colonies(given, moments, spread, extinct)
         if colonies not in (1, count):
             rule = f"left out, as the values are of {count} colonies"
             raise checks.input_error(f"{MEASURES}: colonies", colonies, rule)
@@ -153,7 +153,7 @@ def _is_table(given: Any) -> bool:
 
 
 def _of_colonies(
-    values: Mapping[str, Any], moments: Sequence[float], spread: Any
+    values: Mapping[str, Any], moments: Sequence[float], spread: Any, extinct: bool
 ) -> tuple[dict[str, Any], dict[str, Any], int]:
     """Means and spreads by name, (T,) each, and the number of colonies, of numbers by time and
     colony."""
@@ -174,7 +174,8 @@ def _of_colonies(
         if len(rows) != len(moments) or (missing.any(1) != missing.all(1)).any():
             raise checks.input_error(label, given, rule)
         by_name[name] = rows
-    return means_and_spreads(f"{MEASURES}: values", by_name, "numbers of as many colonies each")
+    alike = "numbers of as many colonies each"
+    return means_and_spreads(f"{MEASURES}: values", by_name, alike, extinct)
 
 
 def _columns(option: str, given: Any, functions: Mapping[str, Any], count: int) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from searching import grown
 
 import torchfilm as tf
 from design import Conditions, Measured, ObservedCourse, Parameter, Search, Sobol, Task
+from design.data_means import means_off
 from design.simulations import simulate_designs
 from design.targets.observed_conditions import checked_data, errors, standard_errors
 
@@ -131,7 +132,7 @@ def test_a_table_says_why_single_colonies_miss_a_mean_by_far():
     ("values", "words"),
     [
         ({"level": [1.0, 2.0]}, r"numbers of 3 colonies at least, since fewer"),
-        ({"level": [0.0, 0.0, 0.0]}, "numbers of which one is not 0.* leave it out"),
+        ({"level": [0.0, 0.0, 0.0]}, "numbers of which one is not 0.* say extinct=True"),
         ({"level": [1.0, math.nan, 2.0]}, r"values\['level'\]"),
         ({"level": 1.0}, r"values\['level'\]"),
         ({"other": [1.0, 2.0, 3.0]}, "by the names 'level'"),
@@ -189,3 +190,48 @@ def test_data_under_conditions_may_be_numbers_of_colonies():
     ])  # fmt: skip
     assert errors(checked_data(data)) == [0.0, 0.0]
     assert standard_errors(checked_data(data)) == pytest.approx([0.1 / math.sqrt(3)] * 2)
+
+
+def counted(state):
+    return state.counts.double()
+
+
+def test_colonies_that_all_died_out_are_data():
+    dead = Measured.of_colonies({"n": counted}, {"n": [0] * 16}, time=2.0, extinct=True)
+    assert dead.wanted["n"] == (0.0, 0.0) and dead.spread["n"] == 0.25  # as if one had 1 cell
+    frames = ObservedCourse.of_measures(
+        {"n": counted},
+        times=TIMES,
+        extinct=True,
+        values={"n": [[4, 4, 4, 4], [2, 3, 0, 0], [0, 0, 0, 0]]},
+    ).frames
+    assert [f.spread[0] for f in frames] == pytest.approx([0.5, 1.5, 0.5])
+    tenths = Measured.of_colonies({"level": level}, {"level": [0.5] * 4}, time=2.0, extinct=True)
+    assert tenths.spread["level"] == 0.005
+
+
+def test_colonies_without_cells_are_warned_of_where_they_would_fail():
+    warned = "1 of 4 colonies are 0.* say extinct=True"
+    with pytest.warns(UserWarning, match=warned):
+        Measured.of_colonies({"n": counted}, {"n": [3, 0, 1, 2]}, time=2.0)
+    values = [[4, 4, 4, 4], [2, 3, 5, 6], [0, 4, 8, 9]]
+    with pytest.warns(UserWarning, match=warned):
+        ObservedCourse.of_measures({"n": counted}, times=TIMES, values={"n": values})
+    # those of one kind are gone, not all cells
+    two = {"n": counted, "twice": counted}
+    Measured.of_colonies(two, {"n": [3, 0, 1, 2], "twice": [1, 2, 1, 2]}, time=2.0)
+
+
+def test_a_report_says_where_means_are_off():
+    rng = np.random.default_rng(0)
+    data = Measured.of_colonies({"n": counted}, {"n": [9, 14, 3, 30, 11, 2, 25, 12]}, time=2.0)
+    data = checked_data(data)
+    value, spread = data.evidence["n"]
+    near = value + spread * rng.normal(size=40) * 0.5
+    assert means_off(data, {"n": near - near.mean() + value}) == ""
+    words = means_off(data, {"n": near - near.mean() + value - 2.0 * spread})
+    error = math.hypot(spread / 8**0.5, near.std(ddof=1) / 40**0.5)
+    assert f"{2.0 * spread / error:.1f} standard errors apart" in words and "of n is" in words
+    assert means_off(data, {"n": [0.0, 0.0]}) == "" == means_off(data, {"other": near})
+    alone = Measured({"n": counted}, {"n": 5.0}, {"n": 1.0}, time=2.0)
+    assert means_off(checked_data(alone), {"n": near}) == ""

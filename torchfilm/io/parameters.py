@@ -102,12 +102,17 @@ def _values(group: h5py.Group) -> dict[str, np.ndarray]:
 def column_names(paths: list[str], taken: set[str]) -> dict[str, str]:
     """A column for each parameter: the shortest end of its path that no other column has, such as
     "k1" for "Circuit.parameters['k1']", "Division.length" beside the cells' length, and
-    "added.mean" of a distribution, whose own names say little."""
+    "added.mean" of a distribution, whose own names say little. A value of a schedule is called as
+    if it were the parameter: "Lysis.rate[3.0]" beside "Growth.rate"."""
     ends = {path: _ends(path) for path in paths}
+    of = lambda end: end.partition("[")[0]
     names = {}
     for path in paths:
         others = taken.union(*(ends[p] for p in paths if p != path))
-        names[path] = next((end for end in ends[path] if end not in others), path)
+        own = of(ends[path][-1])
+        rivals = {of(end) for p in paths if of(ends[p][-1]) != own for end in ends[p]}
+        free = (end for end in ends[path] if end not in others and of(end) not in rivals)
+        names[path] = next(free, path)
     return names
 
 

@@ -329,7 +329,8 @@ def _mothers(tracks: Tracks) -> np.ndarray:
         if mother is None:
             raise InputError(
                 f"{source}: cell {tracks.cell[k]} has the parent {tracks.parent[k]}, which is no"
-                " cell of its colony. Give −1, 0 or nothing where it is not known."
+                " cell of its colony. Give −1, 0 or nothing where it is not known. Of a run: a cell"
+                " that lived between two frames is in none; record more of them (every=)."
             )
         if tracks.first[mother] >= tracks.first[k]:
             raise InputError(

@@ -166,6 +166,10 @@ def _check_known(known: Columns, signals: Columns, wanted: Sequence[str], by: st
             raise checks.input_error("quantity", quantity, "a name, as text", hint)
         if quantity not in known:
             hint = checks.suggestion(quantity, names)
+            hint = (
+                "A time course draws the number of cells in any case." * (quantity == "cells")
+                or hint
+            )
             if quantity in signals:
                 hint = f"What is outside of cells is {OUTSIDE + quantity!r}."
             raise checks.input_error("quantity", quantity, f"one of {', '.join(names)}", hint)
