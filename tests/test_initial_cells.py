@@ -454,7 +454,9 @@ def test_without_mechanics_cells_may_be_anywhere():
 )
 def test_lengths_in_pixels_are_noticed(division, length, pixels):
     scene = tf.Scene(tf.Division(**division), founders=tf.Cells([[0.0, 0.0]], [1.0, 0.0], length))
-    with pytest.raises(tf.InputError, match=r"threshold .* is not above its .* at birth") as caught:
+    with pytest.raises(
+        tf.InputError, match=r"cell .* begins with a (length|volume) of .* threshold is .* at most"
+    ) as caught:
         scene.bind().start()
     said = str(caught.value)
     assert ("look like pixels" in said) == pixels and "Raise the threshold" in said

@@ -155,8 +155,8 @@ def test_a_cell_too_short_for_its_shorter_daughter_fails_its_colony(
     "length, radius, threshold, words",
     [
         # the largest number of any type is not what a cell of type 0 may reach
-        (5.0, 0.5, {0: 4.0, 1: tf.Uniform(8.0, 10.0)}, r"threshold 4 of cell 0 .*birth, 5"),
-        (9.0, 0.5, {0: tf.Uniform(4.0, 8.0), 1: 10.0}, r"of cell 0 .*birth, 9"),
+        (5.0, 0.5, {0: 4.0, 1: tf.Uniform(8.0, 10.0)}, r"cell 0 .* a length of 5, .* is 4 at most"),
+        (9.0, 0.5, {0: tf.Uniform(4.0, 8.0), 1: 10.0}, r"cell 0 .* a length of 9, .* at most"),
         # nor the smallest what it may divide at
         (2.0, 1.5, {0: 4.0, 1: tf.Uniform(2.2, 2.5)}, None),
         (2.0, 1.5, {0: tf.Uniform(3.5, 4.0), 1: 2.5}, None),

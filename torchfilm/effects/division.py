@@ -164,9 +164,9 @@ class Division(Effect):
         if below.numel():
             k = int(below[0])
             raise checks.InputError(
-                f"Division.{self.criterion}: threshold {float(state.division_threshold[k]):g} of"
-                f" cell {int(state.uid[k])} in colony {int(state.own_colony_id[k])} is not above"
-                f" its {self.criterion} at birth, {float(start[k]):g}."
+                f"Division.{self.criterion}: cell {int(state.uid[k])} in colony"
+                f" {int(state.own_colony_id[k])} begins with a {self.criterion} of"
+                f" {float(start[k]):g}, and its threshold is {float(most[k]):g} at most."
                 + _pixels_hint(float(state.length[k]), float(state.radius[k]))
                 + " Raise the threshold or start from smaller cells."
             )
