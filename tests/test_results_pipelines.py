@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import warnings
 
@@ -55,7 +56,7 @@ def test_frames_are_not_asked_for_by_time(swapped):
 def test_a_closed_file_says_so_whatever_is_asked(swapped):
     with tf.Results(swapped) as results:
         pass
-    asked = [n for n, x in vars(tf.Results).items() if isinstance(x, property)]
+    asked = [n for n, _ in inspect.getmembers(tf.Results, lambda x: isinstance(x, property))]
     assert "attributes" in asked and "signal_names" in asked
     for name in asked:
         with pytest.raises(tf.InputError, match=r"run\.h5 is closed: read inside"):
